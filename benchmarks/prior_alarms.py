@@ -26,7 +26,7 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy.audit_problem import measurements_of, simulated
-from rfdropo_bayes.discrepancy.fit import FitTarget, climb
+from rfdropo_bayes.discrepancy.fit import FitTarget, optimise
 from rfdropo_bayes.discrepancy.prior_ends import decided_by_priors
 from rfdropo_bayes.files import read_lines
 from rfdropo_bayes.model.experiment import AuditTable
@@ -55,7 +55,7 @@ def alarmed(job: Job, spread: float) -> dict[str, Any]:
     widths = [channel.valid.shape[-1] for channel in measurements.channels]
     noise = [Autoregression(np.full(n, NOISE), np.array([1.0, MEMORY]), STATED, np.inf) for n in widths]
     target, own = FitTarget(forward, measurements, Stacked(tuple(noise))), problem.coordinates
-    fit = climb(target, own.encode(hidden.values), np.arange(own.base))
+    fit = optimise(target, own.encode(hidden.values), np.arange(own.base))
     draws = fit.draws(np.random.default_rng(number), DRAWS, *own.bounds)
     values = own.values(draws)[:, : own.base]
     return {

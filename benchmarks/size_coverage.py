@@ -28,7 +28,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.audit_record import STIFFNESS, relative_sizes
 from rfdropo_bayes.discrepancy.base_fit import first_target
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
-from rfdropo_bayes.discrepancy.fit import Fit, climb, widened
+from rfdropo_bayes.discrepancy.fit import Fit, optimise, widened
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.files import append_line, read_lines
 from rfdropo_bayes.mechanisms import REGISTRY
@@ -59,7 +59,7 @@ def one(name: str, number: int, given: argparse.Namespace, workshop: Workshop) -
         target = replace(target, noise=Stacked(tuple(parts)))
     own = [i for c in problem.candidates if c.name == name for i in c.indices]
     free = np.array([*range(problem.coordinates.base), *own])
-    fit = climb(target, problem.coordinates.encode(hidden.values), free)
+    fit = optimise(target, problem.coordinates.encode(hidden.values), free)
     sizes = widened(target, fit)
     rows = [row for i in own if (row := deviation(problem.coordinates, sizes, i, hidden))]
     done = {"converged": fit.converged, "discretisation": hidden.rho["discretisation"], "estimated": estimated}

@@ -68,7 +68,7 @@ def one(case: Case, folder: Path, workshop: Workshop) -> dict[str, Any]:
     line |= {"law": found.content["law"], "findings": [row["mechanism"] for row in found.content["findings"]]}
     line |= {"seconds": round(time.monotonic() - began, 1), "cpu_seconds": round(time.process_time() - used, 1)}
     line |= {"profile": found.content["profile"], "ports": leading_ports(found.content["ports"])}
-    line |= {"gate_nats": (found.content["ports"] or {}).get("gate_nats")}
+    line |= {"null_quantile_nats": (found.content["ports"] or {}).get("null_quantile_nats")}
     return line | judged(line, name, noise_of(unseen, hidden.clean))
 
 
@@ -83,7 +83,7 @@ def forced_search(model: rb.Model, seed: int, workshop: Workshop) -> dict[str, A
     search = law_search(target, problem.ports, channels, unit, seed, problem.rules.family, lambda line: None)
     found = search.find(target, base, forced=True)
     terms = [[refit.term.port.name, refit.term.feature.formula(channels), refit.score] for refit in found.terms]
-    numbers = {"port_p": found.ports[0].adjusted_p, "gate_nats": found.gate, "offered_nats": found.offered}
+    numbers = {"port_p": found.ports[0].adjusted_p, "null_quantile_nats": found.gate, "offered_nats": found.offered}
     seconds = round(time.process_time() - began, 1)
     return {"verdict": "a law" if terms else "no law", **numbers, "terms": terms, "cpu_seconds": seconds}
 
@@ -178,9 +178,9 @@ def show_forced(lines: Sequence[dict[str, Any]]) -> None:
     print("|---|---|---|---|---|---|")
     for line in lines:
         terms = "; ".join(f"{formula} at {port}" for port, formula, _ in line["terms"]) or "none"
-        gains = f"{line['offered_nats']:.1f} | {line['gate_nats']:.1f}"
+        gains = f"{line['offered_nats']:.1f} | {line['null_quantile_nats']:.1f}"
         print(f"| {line['seed']} | {line['port_p']:.2g} | {gains} | {terms} | {line['cpu_seconds']} |")
-    rate("largest gain over the gate", [line["offered_nats"] > line["gate_nats"] for line in lines])
+    rate("largest gain over the gate", [line["offered_nats"] > line["null_quantile_nats"] for line in lines])
     rate("a term joined", [bool(line["terms"]) for line in lines])
 
 

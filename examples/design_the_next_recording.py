@@ -40,7 +40,7 @@ axes[0].step(time, 1e3 * sent, where="post", label=first[0].cable_names)
 axes[0].set(xlabel="time [s]", ylabel="pull [mm]", title="proposed", ylim=(-0.1, 3.2))  # room for the legend
 axes[0].legend(ncols=4, fontsize="small", loc="upper center")
 spread = {}
-for words, second in (("another like it", again), ("the proposed one", designed)):
+for words, second in (("a second recording like the first", again), ("the proposed recording", designed)):
     fit = rb.calibrate(model, [*first, *second], rb.Laplace(starts=1), seed=0, show=False)
     draws = fit.idata.posterior["rayleigh_stiffness"].values.ravel()
     axes[1].hist(1e3 * draws, bins=30, density=True, alpha=0.5, label=words)
@@ -50,4 +50,4 @@ axes[1].set(xlabel="stiffness damping [ms]", title="after a second recording")
 axes[1].legend()
 figure.savefig(sys.argv[1] if len(sys.argv) > 1 else "design_the_next_recording.png")
 print(", ".join(f"{words}: damping to {100 * value:.1f} %" for words, value in spread.items()))
-assert spread["the proposed one"] < 0.85 * spread["another like it"]
+assert spread["the proposed recording"] < 0.85 * spread["a second recording like the first"]

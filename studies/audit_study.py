@@ -16,7 +16,7 @@ from scipy.stats import binomtest
 
 from rfdropo_bayes.discrepancy.audit_problem import measurements_of, simulated
 from rfdropo_bayes.discrepancy.audit_record import STIFFNESS
-from rfdropo_bayes.discrepancy.fit import climb
+from rfdropo_bayes.discrepancy.fit import optimise
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.verdict import DESCRIBED, EQUIVALENT, EXPLAINED, NO_DISCREPANCY, PARTLY, UNEXPLAINED
 from rfdropo_bayes.errors import InputError, Interrupted
@@ -325,7 +325,7 @@ def error_over_oracle(answer: Answer, names: Sequence[str], hidden: Hidden) -> f
     problem, coordinates = answer.problem, answer.problem.coordinates
     own = [i for c in problem.candidates if c.name in names for i in c.indices]
     start = coordinates.encode(hidden.values)
-    oracle = climb(answer.target, start, np.array([*range(coordinates.base), *own]))
+    oracle = optimise(answer.target, start, np.array([*range(coordinates.base), *own]))
     untouched = range(len(problem.trajectories), len(problem.model.recordings.names))
     tested = measurements_of(problem, untouched)
     predicted = simulated(problem, False, tested, untouched).observe_one(oracle.x)["position"]

@@ -25,7 +25,7 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.discrepancy.audit_problem import measurements_of, simulated
-from rfdropo_bayes.discrepancy.fit import FitTarget, climb
+from rfdropo_bayes.discrepancy.fit import FitTarget, optimise
 from rfdropo_bayes.discrepancy.score import project_out, span
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.assembly import build_simulator
@@ -275,7 +275,7 @@ def _discretisation(target: FitTarget, truth: np.ndarray, made: Observation, mem
     shown = [np.asarray(part)[firsts] for part in (made.position, made.tension)]
     channels = zip(target.measurements.channels, shown, strict=False)
     fitted = replace(target.measurements, channels=tuple(replace(c, readings=part) for c, part in channels))
-    refit = climb(replace(target, measurements=fitted), truth, np.arange(target.forward.coordinates.base))
+    refit = optimise(replace(target, measurements=fitted), truth, np.arange(target.forward.coordinates.base))
     return float(np.sqrt(np.mean(refit.residual**2)))
 
 

@@ -23,7 +23,7 @@ FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ")
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
-LENGTHS = ("length", "radius", "tip_radius", "inner_radius", "disk_thickness", "cable_radius", "spool_radius")
+LENGTHS = ("length", "radius", "tip_radius", "inner_radius", "cable_radius", "spool_radius")
 FACTORS = {**dict.fromkeys(LENGTHS, MILLIMETRES), "mass": 1e-3, "young_modulus": 1e6}  # from the units of options to SI
 
 
@@ -106,7 +106,6 @@ InnerRadius = Annotated[
 NumberOfDisks = Annotated[
     int | None, typer.Option("--disks", help="number of disks; 10 by default, or the next multiple of the segments")
 ]
-DiskThickness = Annotated[float, typer.Option("--disk-thickness-mm", help="thickness of each disk [mm]")]
 Segments = Annotated[int | None, typer.Option(help="number of segments, each with its own cables")]
 SegmentLengths = Annotated[
     str | None, typer.Option("--segment-lengths-mm", help='lengths of the segments, base to tip: "60,62.5,64"')
@@ -168,7 +167,6 @@ def init(
     tip_radius: TipRadius = None,
     inner_radius: InnerRadius = None,
     disks: NumberOfDisks = None,
-    disk_thickness: DiskThickness = 3.0,
     segments: Segments = None,
     segment_lengths: SegmentLengths = None,
     cables: Cables = None,
@@ -216,7 +214,7 @@ def init(
             f"the unit {unit!r} is unknown", where="--command-unit", remedy=f"use one of {', '.join(UNITS)}"
         )
     answers = _body(ask, shape, length, radius, tip_radius, cable_radius)
-    answers |= {"inner_radius": inner_radius, "disk_thickness": disk_thickness}
+    answers["inner_radius"] = inner_radius
     answers["segments"] = ask.answer("segments", segments, "Segments with their own cables", 1)
     if segment_lengths is None and answers["segments"] > 1:
         ask.assumed.add("segment_lengths")

@@ -140,8 +140,8 @@ class CsvColumns(BaseModel):
     axes: Annotated[tuple[str, str, str], AfterValidator(_each_once)] = Field(
         ("x", "y", "z"),
         description="the base frame's x, y, z in terms of the file's axes, e.g. "
-        '["x", "z", "-y"] for a trunk that hangs in a frame with y up; if the file\'s frame is left-handed, '
-        "as Unity's is, axes that are left-handed as well",
+        '["x", "z", "-y"] for a trunk that hangs in a frame with y up; left-handed axes if the file\'s frame '
+        "is left-handed, as in Unity",
     )
     origin: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0),

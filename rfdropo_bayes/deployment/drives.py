@@ -525,7 +525,7 @@ class Drives:
 
         Args:
             timeout: longest wait [s].
-            meanwhile: called before the wait.
+            meanwhile: function called before the wait.
 
         Returns:
             Whether every drive has answered in time.

@@ -19,7 +19,7 @@ from rfdropo_bayes.discrepancy.law_words import unknown_record
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.prequential import in_words, prequential, span_in_words
 from rfdropo_bayes.discrepancy.score import likeness
-from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow
+from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
 from rfdropo_bayes.discrepancy.sentence import sentence
 from rfdropo_bayes.discrepancy.verdict import NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
 
@@ -51,12 +51,12 @@ def record(
         "base_fit_converged": answer.base.converged,
         "out_of_time": bool(answer.cost.stopped),
         "stopped": answer.cost.stopped,
-        "not_done": list(answer.cost.left),
+        "not_done": list(answer.cost.unfinished),
         "left_out": dict(answer.problem.left_out),
         "adopted": [step.name for step in answer.adopted],
         "unsupported": list(answer.causes.unsupported),
         "bootstraps": answer.problem.rules.bootstraps,
-        "omnibus": [{"after": n, **_omnibus(screen)} for n, screen in enumerate(answer.causes.screens)],
+        "omnibus": [{"after": n, **_omnibus(tests)} for n, tests in enumerate(answer.causes.test_series)],
         "gain": None
         if gain is None
         else {
@@ -125,7 +125,7 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
     elif answer.verdict == NEGLIGIBLE:
         words = "Nothing need be done: the residual is too small to matter."
     elif answer.law is not None:
-        looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.found.terms))
+        looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.search.terms))
         words = f"Look at {looks}: the library has no mechanism that acts so."
     elif not answer.fitted:
         words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--from)."
@@ -145,7 +145,7 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         words = f"To tell {both}: {checks}. Or let `rfdropo design` propose commands that differ."
         return {"sentence": words, "separates": list(apart.members)}
     elif not answer.causes.steps:
-        leading = [row.name for row in answer.causes.screens[0].rows[:2]]
+        leading = [row.name for row in answer.causes.test_series[0].rows[:2]]
         asked = " and ".join(spoken(each) for each in leading) or "candidates of your own"
         words = (
             f"Send the commands that `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
@@ -187,10 +187,10 @@ def _remedy(answer: Answer, name: str) -> str:
 
 def _watch(answer: Answer) -> str:
     """Advice on the place to watch: time and marker of the base model's largest misfit."""
-    found = prequential(answer.target, answer.base)
-    worst, markers = int(np.argmax(found.surprise)), answer.problem.model.recordings.markers
-    marker = markers[int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))]
-    first, last = found.edges[worst : worst + 2]
+    scores = prequential(answer.target, answer.base)
+    worst, markers = int(np.argmax(scores.surprise)), answer.problem.model.recordings.markers
+    marker = markers[int(np.argmax(scores.misfit.reshape(-1, 3).sum(axis=1)))]
+    first, last = scores.edges[worst : worst + 2]
     return f"watch {marker} while the commands {span_in_words(first, last, answer.problem.timed)} are sent again"
 
 
@@ -249,15 +249,15 @@ def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, An
         return None
     keys = ("mechanism", "group", "parameters", "relative", "log_bayes_factor")
     alike = [list(step.members[1:]) for step in answer.causes.steps]
-    found = [
+    rows = [
         {**{key: finding[key] for key in keys}, "not_told_from": others}
         for finding, others in zip(findings, alike, strict=True)
     ]
     return {
         "groups": {name: list(members) for name, members in groups.members.items()},
         "left_out": list(groups.left_out),
-        "differences": [row for row in found if row["group"]],
-        "in_both": [row for row in found if not row["group"]],
+        "differences": [row for row in rows if row["group"]],
+        "in_both": [row for row in rows if not row["group"]],
     }
 
 
@@ -265,10 +265,10 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
     """Posterior of parameters in physical units, from the extended model's normal approximation."""
     coordinates = answer.problem.coordinates
     values = coordinates.values(answer.draws)
-    found = {}
+    parameters = {}
     for i in indices:
         column = values[:, i]
-        found[coordinates.names[i]] = {
+        parameters[coordinates.names[i]] = {
             "title": coordinates.space.parameters[i].spec.name,
             "mean": float(column.mean()),
             "sd": float(column.std()),
@@ -276,7 +276,7 @@ def _drawn_parameters(answer: Answer, indices: tuple[int, ...]) -> dict[str, Any
             "q95": float(np.quantile(column, 0.95)),
             "unit": coordinates.space.parameters[i].spec.unit,
         }
-    return found
+    return parameters
 
 
 def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -> dict[str, Any]:
@@ -288,7 +288,7 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
     place = {int(i): k for k, i in enumerate(fit.free)}
     modulus = coordinates.names.index(STIFFNESS)
     named, slopes = coordinates.named(fit.x), coordinates.slopes(fit.x[None])[0]
-    found = {}
+    sizes = {}
     for i in indices:
         name, own = coordinates.names[i], coordinates.space.parameters[i].spec
         unit = own.unit
@@ -299,20 +299,20 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
         gradient[place[i]] = slopes[i] / named[name]
         gradient[place[modulus]] -= power * slopes[modulus] / named[STIFFNESS]
         ratio = named[name] / named[STIFFNESS] ** power
-        spread = float(np.sqrt(gradient @ fit.covariance @ gradient))
-        low, high = ratio * (1 - 1.645 * spread), ratio * (1 + 1.645 * spread)
+        deviation = float(np.sqrt(gradient @ fit.covariance @ gradient))
+        low, high = ratio * (1 - 1.645 * deviation), ratio * (1 + 1.645 * deviation)
         relation = f"_over_{STIFFNESS}" if power > 0 else f"_times_{STIFFNESS}"
-        found[f"{name}{relation}"] = {
+        sizes[f"{name}{relation}"] = {
             "title": f"{own.name}{relation}",
             "parameter": name,
             "power": power,
             "mean": ratio,
-            "sd": abs(ratio) * spread,
+            "sd": abs(ratio) * deviation,
             "q05": min(low, high),
             "q95": max(low, high),
             "unit": f"{unit}/Pa" if power > 0 else f"{unit} Pa",
         }
-    return found
+    return sizes
 
 
 def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, float]:
@@ -320,44 +320,44 @@ def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, fl
     return {answer.problem.coordinates.names[i]: named[answer.problem.coordinates.names[i]] for i in free}
 
 
-def _omnibus(screen: Screen) -> dict[str, Any]:
+def _omnibus(tests: ScoreTests) -> dict[str, Any]:
     return {
-        "p": screen.omnibus.p,
-        "finer_mesh": screen.refined,
-        "tests": screen.omnibus.single,
-        "blocks": [None if np.isnan(block) else block for block in screen.omnibus.blocks.tolist()],
+        "p": tests.omnibus.p,
+        "finer_mesh": tests.refined,
+        "tests": tests.omnibus.single,
+        "blocks": [None if np.isnan(block) else block for block in tests.omnibus.blocks.tolist()],
     }
 
 
 def _where(answer: Answer) -> dict[str, Any]:
     """Time and place of the base model's misfit."""
-    found, problem = prequential(answer.target, answer.base), answer.problem
+    scores, problem = prequential(answer.target, answer.base), answer.problem
     markers = problem.model.recordings.markers
-    misfit = np.sqrt(found.misfit.reshape(-1, 3).mean(axis=1))
+    misfit = np.sqrt(scores.misfit.reshape(-1, 3).mean(axis=1))
     return {
-        "sentence": in_words(found, markers, problem.rules.base_passes, problem.timed),
-        "block_edges_s": found.edges.tolist(),
-        "prequential_score": found.score.tolist(),
-        "block_p": found.p.tolist(),
+        "sentence": in_words(scores, markers, problem.rules.base_passes, problem.timed),
+        "block_edges_s": scores.edges.tolist(),
+        "prequential_score": scores.score.tolist(),
+        "block_p": scores.p.tolist(),
         "marker_misfit": dict(zip(markers, misfit.tolist(), strict=True)),
     }
 
 
 def _candidates(answer: Answer) -> list[dict[str, Any]]:
     """Score tests of all candidates at the base model, the best first."""
-    first = answer.causes.screens[0]
+    first = answer.causes.test_series[0]
     refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
     return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]
 
 
-def _candidate(answer: Answer, row: ScreenRow, screen: Screen, refit: float | None) -> dict[str, Any]:
+def _candidate(answer: Answer, row: ScoreRow, tests: ScoreTests, refit: float | None) -> dict[str, Any]:
     coordinates = answer.problem.coordinates
     alike: list[tuple[float, str]] = []
     at: dict[str, float] = {}
     if row.probe is not None:
         alike = [
             (round(likeness(row.probe.mark, other.probe.mark), 4), other.name)
-            for other in screen.rows
+            for other in tests.rows
             if other is not row and other.probe is not None
         ]
         point = answer.base.x.copy()
@@ -372,7 +372,7 @@ def _candidate(answer: Answer, row: ScreenRow, screen: Screen, refit: float | No
         "degrees_of_freedom": row.rank,
         "p": row.p,
         "adjusted_p": row.adjusted_p,
-        "would_explain": row.lm / max(float(screen.fit.residual @ screen.fit.residual), 1e-300),
+        "would_explain": row.lm / max(float(tests.fit.residual @ tests.fit.residual), 1e-300),
         "tried_at": at,
         "log_bayes_factor": refit,
         "named": any(step.name == row.name for step in answer.causes.steps),

@@ -21,8 +21,8 @@ from rfdropo_bayes.discrepancy.fit import (
     FitTarget,
     base_optimum,
     better_nearby,
-    climb,
-    climb_rollouts,
+    optimisation_rollouts,
+    optimise,
     optimum_rollouts,
     poll_rollouts,
     with_usable_differences,
@@ -80,7 +80,7 @@ def first_target(problem: AuditProblem, journal: Journal, deadline: Deadline | N
     measurements = measurements_of(problem, range(len(problem.trajectories)), problem.trajectories)
     noise = problem.stated_noise
     if measurements.has_repeats:
-        noise = measurements.noise(measurements.spread, 0)
+        noise = measurements.noise(measurements.departures, 0)
     if noise is None:
         scales = [np.full(c.valid.shape[-1], GUESSES[c.name]) for c in measurements.channels]
         noise = Stacked(tuple(Autoregression(scale, np.ones(1), RESIDUALS, np.inf) for scale in scales))
@@ -109,18 +109,18 @@ def base_fits(
     smooth = with_usable_differences(target, first)
     if smooth.forward.lanes.difference != target.forward.lanes.difference:
         report(f"motion is rough: derivatives over relative steps of {smooth.forward.lanes.difference:g}")
-    judge, fit = fit_with_noise(smooth, first, free)
+    fit_target, fit = fit_with_noise(smooth, first, free)
     for _ in range(AGAIN):
-        yield Reached.at(judge, replace(fit, promise=np.inf))
-        better = better_nearby(judge, fit)
+        yield Reached.at(fit_target, replace(fit, promise=np.inf))
+        better = better_nearby(fit_target, fit)
         if better is None:  # for a motion with kinks, as with slack cables, slopes predict gains that do not exist
             fit = replace(fit, promise=0.0) if fit.promise < WITHIN else fit
             break
         report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
-        fit = climb(judge, better, free)
+        fit = optimise(fit_target, better, free)
     else:
-        fit = fit if better_nearby(judge, fit) is None else replace(fit, promise=np.inf)
-    yield Reached.at(judge, fit) if known else Reached.at(*under_residual_noise(judge, fit))
+        fit = fit if better_nearby(fit_target, fit) is None else replace(fit, promise=np.inf)
+    yield Reached.at(fit_target, fit) if known else Reached.at(*under_residual_noise(fit_target, fit))
 
 
 def base_model(
@@ -163,7 +163,7 @@ def residual_noise(target: FitTarget, fit: Fit) -> Stacked:
     counts as far off, see `inadequacy`.
     """
     measured = target.measured.measurements
-    left = np.array(measured.spread)
+    left = np.array(measured.departures)
     for group, error in zip(measured.members, target.errors(fit.x), strict=True):
         left[list(group)] += error
     noise = measured.noise(np.where(measured.single_valid, left, 0.0), len(fit.free))
@@ -183,8 +183,8 @@ def _announce(target: FitTarget, searches: bool, report: Callable[[str], None]) 
         began = time.monotonic()
         forward.observe(np.clip(points, *own.bounds))
         took.append(time.monotonic() - began)
-    climbs = 3 if target.noise.source == RESIDUALS else 1  # noise and fit in turn
-    rollouts = climbs * climb_rollouts(target, own.base) + poll_rollouts(target)
+    optimisations = 3 if target.noise.source == RESIDUALS else 1  # noise and fit in turn
+    rollouts = optimisations * optimisation_rollouts(target, own.base) + poll_rollouts(target)
     rollouts += optimum_rollouts(target) if searches else 0
     forward.compiling = max(took[0] - took[1], 0.0)
     words = about(rollouts * forward.pace + forward.compiling)

@@ -119,16 +119,16 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
     return probes + _probe_grid(target, fit, base, jobs)
 
 
-def screening_rollouts(target: FitTarget, candidates: Sequence[Candidate]) -> int:
+def score_test_rollouts(target: FitTarget, candidates: Sequence[Candidate]) -> int:
     """Rollouts that `probe_all` takes: a slope for each parameter, and the grids of shapes."""
     forward, parameters = target.forward, target.forward.coordinates.space.parameters
-    found = 0
+    rollouts = 0
     for candidate in candidates:
         own = [parameters[i] for i in candidate.indices]
         touched = sum(any(p.holds_for(name) for p in own) for name in target.measurements.names)
         shapes = [len(p.spec.grid) for p in own if p.spec.grid]
-        found += touched * (forward.lanes.slope_rollouts * len(own) + int(np.prod(shapes)) * bool(shapes))
-    return found
+        rollouts += touched * (forward.lanes.slope_rollouts * len(own) + int(np.prod(shapes)) * bool(shapes))
+    return rollouts
 
 
 def _shapes(target: FitTarget, candidate: Candidate, size: dict[int, float]) -> list[int]:
@@ -249,14 +249,14 @@ def _best_of(
     the last of several with the same decrease.
     """
     base = span(fit.jacobian)
-    found = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
-    left = np.sum(project_out(base, found.T) ** 2, axis=0)
-    best = len(left) - 1 - int(np.argmin(left[::-1]))
+    residuals = target.recall("way", [points], lambda: {"residual": target.residual(points)})["residual"]
+    remaining = np.sum(project_out(base, residuals.T) ** 2, axis=0)
+    best = len(remaining) - 1 - int(np.argmin(remaining[::-1]))
     at_null = float(np.sum(project_out(base, fit.residual[:, None]) ** 2))
     start = points[best]
-    step = np.linalg.lstsq(fit.jacobian, found[best], rcond=1e-6)[0]
+    step = np.linalg.lstsq(fit.jacobian, residuals[best], rcond=1e-6)[0]
     start[fit.free] += np.clip(step, -1.0, 1.0)
-    return at_null - float(left[best]), start, best
+    return at_null - float(remaining[best]), start, best
 
 
 def discretisation_probe(

@@ -61,9 +61,9 @@ class Coordinates:
         """The same with parameters after all others, which are measured from their null values."""
         fresh = added.sample(jax.random.key(len(self.names)), PRIOR_DRAWS)
         draws = self._draws | {name: np.asarray(values, dtype=float) for name, values in fresh.items()}
-        found = replace(self, space=self.space.with_further(added.parameters), draws=draws, moved=self._moved)
-        assert found.affine[len(self.names) :].all()
-        return found
+        extended = replace(self, space=self.space.with_further(added.parameters), draws=draws, moved=self._moved)
+        assert extended.affine[len(self.names) :].all()
+        return extended
 
     def widened(self, factors: Float[np.ndarray, " d"]) -> Coordinates:
         """The same with priors and units of candidates' sizes widened about null by ``factors``."""
@@ -97,7 +97,7 @@ class Coordinates:
 
     @cached_property
     def _scale(self) -> np.ndarray:
-        return np.array([_spread(p, self._draws[p.name]) for p in self.space.parameters])
+        return np.array([_deviation(p, self._draws[p.name]) for p in self.space.parameters])
 
     @property
     def _unit(self) -> np.ndarray:
@@ -191,11 +191,11 @@ class Coordinates:
 
         return jax.jit(lambda u: jax.jvp(values, (u,), (jnp.ones_like(u),)))
 
-    def _with_moved(self, found: Float[np.ndarray, "n d"], x: Float[np.ndarray, "n d"], which: int) -> np.ndarray:
+    def _with_moved(self, values: Float[np.ndarray, "n d"], x: Float[np.ndarray, "n d"], which: int) -> np.ndarray:
         """``found`` with values (0) or slopes (1) of the parameters that are moved unconstrained in their places."""
         if not self.affine.all():
-            found[:, ~self.affine] = padded(self._moved, x[:, ~self.affine])[which]
-        return found
+            values[:, ~self.affine] = padded(self._moved, x[:, ~self.affine])[which]
+        return values
 
     def prior_slopes(self, x: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
         """First and second derivatives of `log_prior` at one point; each depends on its own coordinate only."""
@@ -231,8 +231,8 @@ class Coordinates:
     ) -> Float[np.ndarray, "n recording physical"]:
         """Inputs of the simulator for each recording."""
         start, specs = np.array(list(self.nominal.values())), [self.space.specs[name] for name in self.physical]
-        found = self._scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
-        return np.clip(found, *np.transpose([(spec.low, spec.high) for spec in specs]))
+        inputs = self._scattered(np.tile(start, (len(x), len(slots), 1)), self.values(x), slots)
+        return np.clip(inputs, *np.transpose([(spec.low, spec.high) for spec in specs]))
 
     def physical_tangents(
         self, x: Float[np.ndarray, "n d"], directions: Float[np.ndarray, "n d"], slots: Int[np.ndarray, "recording d"]
@@ -251,6 +251,6 @@ class Coordinates:
         return theta
 
 
-def _spread(parameter: InferredParameter, draws: np.ndarray) -> float:
+def _deviation(parameter: InferredParameter, draws: np.ndarray) -> float:
     """Scale of the prior: its own if it has a scale, so that a half-normal at null is a standard normal's half."""
     return float(parameter.table.get("scale", 0.0)) or float(np.std(draws)) or 1.0

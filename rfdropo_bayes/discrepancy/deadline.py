@@ -30,13 +30,13 @@ def thread_times() -> dict[str, tuple[float, float]]:
 
     Empty if the system does not count them, as only Linux does.
     """
-    found = {}
+    times = {}
     with suppress(OSError):
         for thread in THREADS.iterdir():
             with suppress(OSError, ValueError):  # a thread that has ended meanwhile
                 ran, waited, _ = map(int, (thread / "schedstat").read_text().split())
-                found[thread.name] = (NANOSECOND * ran, NANOSECOND * waited)
-    return found
+                times[thread.name] = (NANOSECOND * ran, NANOSECOND * waited)
+    return times
 
 
 def delay(elapsed: float, before: Times, after: Times, processors: int) -> float:
@@ -116,7 +116,7 @@ class Deadline:
         self._charged, self._threads = now, threads
 
     @property
-    def left(self) -> float:
+    def remaining(self) -> float:
         """Minutes until rollouts stop."""
         return self.share * self.minutes - (time.monotonic() - self.began) / 60.0
 
@@ -125,7 +125,7 @@ class Deadline:
         self._charge()
         if self.why != INTERRUPT and interrupted():
             self._stop(INTERRUPT)
-        if self.left <= 0.0:
+        if self.remaining <= 0.0:
             self._stop(TIME)
 
     def _stop(self, why: str) -> NoReturn:

@@ -16,11 +16,11 @@ import numpy as np
 
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, Rules
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise, widened
 from rfdropo_bayes.discrepancy.gain import Gain
-from rfdropo_bayes.discrepancy.held_out import HeldOut, JudgedModel, predicted, stages_of
+from rfdropo_bayes.discrepancy.held_out import FittedModel, HeldOut, predicted, stages_of
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
-from rfdropo_bayes.discrepancy.law_search import FoundLaw, Refit, law_search
+from rfdropo_bayes.discrepancy.law_search import LawResult, Refit, law_search
 from rfdropo_bayes.discrepancy.naming import Named
 from rfdropo_bayes.discrepancy.repairs import without
 
@@ -33,7 +33,7 @@ class Described:
     """Result of a search for laws in an audit.
 
     Attributes:
-        found: ports and law.
+        search: ports and law.
         steps: library mechanisms in the model beside the law.
         stand_ins: library mechanisms that the law replaces.
         gain: gain of the law on unseen recordings over the model without it; None without a law, or if the time was up.
@@ -42,7 +42,7 @@ class Described:
         holds: whether unseen recordings clearly support the law.
     """
 
-    found: FoundLaw
+    search: LawResult
     steps: tuple[Added, ...] = ()
     stand_ins: tuple[str, ...] = ()
     gain: Gain | None = None
@@ -58,7 +58,7 @@ class Described:
     @property
     def last(self) -> Refit | None:
         """The model with the law."""
-        return self.found.last
+        return self.search.last
 
     @cached_property
     def sizes(self) -> tuple[Fit, FitTarget] | None:
@@ -126,14 +126,14 @@ def _without(model: Named, gone: Sequence[str]) -> Named:
     """A model without some of its mechanisms, with a new noise model."""
     for name in gone:
         model = model.extended(without(model.asked, model.steps, model.names.index(name), model.base))
-    judge, fit = fit_with_noise(model.judge.measured, model.fit.x, model.fit.free)
-    return model.extended([*model.steps[:-1], replace(model.steps[-1], judge=judge, fit=fit)])
+    fit_target, fit = fit_with_noise(model.fit_target.measured, model.fit.x, model.fit.free)
+    return model.extended([*model.steps[:-1], replace(model.steps[-1], fit_target=fit_target, fit=fit)])
 
 
 def _needed(problem: AuditProblem, described: Described) -> list[str]:
     """Mechanisms beside a law without which unseen recordings are clearly less likely; the last is tested first."""
     assert described.last is not None
-    judge, fit, coordinates = described.last.target, described.last.fit, described.last.target.forward.coordinates
+    fit_target, fit, coordinates = described.last.target, described.last.fit, described.last.target.forward.coordinates
     finer = DISCRETISATION in described.beside
     needed: list[str] = []
     for step in reversed(described.steps):
@@ -144,8 +144,8 @@ def _needed(problem: AuditProblem, described: Described) -> list[str]:
             continue
         start = fit.x.copy()
         start[own] = coordinates.null[own]
-        less = climb(judge, start, np.setdiff1d(fit.free, own))
-        seen = predicted(problem, judge.measured, [JudgedModel(judge, each, finer) for each in (less, fit)])
+        less = optimise(fit_target, start, np.setdiff1d(fit.free, own))
+        seen = predicted(problem, fit_target.measured, [FittedModel(fit_target, each, finer) for each in (less, fit)])
         if seen.count < 2 or seen.gain(0, 1).clear:
             needed.append(step.name)
         else:
@@ -165,11 +165,11 @@ def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) 
     options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups, problem.timed)
     before = stages_of(model.search.target, model.base, model.steps)
     named = len(before) - 1
-    for law in law_search(model.judge, *options).laws(model.judge, model.fit):
+    for law in law_search(model.fit_target, *options).laws(model.fit_target, model.fit):
         if not law.terms:
             yield Described(law, model.steps)
             continue
-        stages = [*before, *(JudgedModel(refit.target, refit.fit, before[-1].finer) for refit in law.terms)]
+        stages = [*before, *(FittedModel(refit.target, refit.fit, before[-1].finer) for refit in law.terms)]
         held_out = predicted(problem, model.search.target.measured, stages)
         count = len(law.terms)
         if held_out.count < len(stages):
@@ -203,7 +203,7 @@ def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:
     unit = str(getattr(simulator, "command_unit", "m"))
     draws = fit.draws(np.random.default_rng([seed, 7]), 1000, *coordinates.bounds)
     values, rows = coordinates.values(draws), []
-    for refit in described.found.terms:
+    for refit in described.search.terms:
         column = values[:, coordinates.names.index(refit.term.spec.name)]
         shape = None if refit.term.shape is None else values[:, coordinates.names.index(refit.term.shape.name)]
         rows.append(

@@ -1,7 +1,7 @@
 """Possible differences between groups of recordings, such as sessions: candidates of an audit of recordings in groups.
 
-A difference is added to a value that all groups share: a base parameter is higher in one group than elsewhere, a
-mechanism is present or larger in one group only, or absent there. A mechanism that all groups lack is a candidate as
+A difference is added to a value that all groups share. A base parameter is higher in one group, or a mechanism is
+present, larger or absent in one group only. A mechanism that all groups lack is a candidate as
 well, under its plain name: without it, an error of the base model could be taken for a difference between groups.
 """
 
@@ -81,7 +81,7 @@ def with_differences(
     groups: Groups,
     *,
     spreads: Mapping[str, float],
-    held: Sequence[str] = (),
+    fixed: Sequence[str] = (),
 ) -> tuple[Scopes, list[Candidate]]:
     """Parameters and candidates, including possible differences between groups.
 
@@ -92,29 +92,29 @@ def with_differences(
         library: candidates that all groups may lack.
         groups: groups of the recordings.
         spreads: standard deviations between groups that the model states, by parameter [its unit].
-        held: fixed parameters, which therefore do not differ.
+        fixed: fixed parameters, which therefore do not differ.
     """
-    found = _Space(list(space.parameters))
+    extended = _Space(list(space.parameters))
     candidates = list(library)
     shared = {p.spec.name: p for p in space.parameters[:base] if not p.scope.owner}
     free = {p.physical for p in space.parameters[:base] if p.scope.owner}  # differ between recordings or groups already
     places: dict[str, dict[str, int]] = {}  # by group, by parameter
-    known = {*held, *free}
+    known = {*fixed, *free}
     specs = [spec for spec in simulated if spec.name not in known and (spec.name in shared or spec.prior)]
     for spec in specs:
         spread = np.sqrt(2.0) * spreads[spec.name] if spec.name in spreads else _deviation_of(spec, shared)
         for group in groups.shifted if spec.name in shared else groups.names:
-            places.setdefault(group, {})[spec.name] = found.add(_difference(spec, spread, group, groups))
+            places.setdefault(group, {})[spec.name] = extended.add(_difference(spec, spread, group, groups))
     for group in groups.names:
         own = places.get(group, {})
         candidates += [_changed([spec], [own[spec.name]], group, groups) for spec in specs if spec.name in own]
         for family in families([spec for spec in specs if spec.name in own]):
             candidates.append(_changed(family, [own[spec.name] for spec in family], group, groups))
-        candidates += [_in_one_group(candidate, group, groups, found) for candidate in library]
+        candidates += [_in_one_group(candidate, group, groups, extended) for candidate in library]
     # an effect of either sign is added to the shared value, and so may be absent in one
     for scope in groups.complements:
-        candidates += [_in_one_group(each, scope, groups, found) for each in library if _one_sided(each, found)]
-    return replace(space, parameters=tuple(found.parameters)), candidates
+        candidates += [_in_one_group(each, scope, groups, extended) for each in library if _one_sided(each, extended)]
+    return replace(space, parameters=tuple(extended.parameters)), candidates
 
 
 def _deviation_of(spec: ParameterSpec, shared: Mapping[str, InferredParameter]) -> float:
@@ -141,25 +141,25 @@ def _changed(specs: Sequence[ParameterSpec], places: Sequence[int], group: str, 
     return Candidate(name, tuple(places), change, name, group)
 
 
-def _in_one_group(candidate: Candidate, group: str, groups: Groups, found: _Space) -> Candidate:
+def _in_one_group(candidate: Candidate, group: str, groups: Groups, extended: _Space) -> Candidate:
     """A mechanism of the library in one group only. Shapes, which have no effect without it, are shared."""
-    parameters = [found.parameters[i] for i in candidate.indices]
+    parameters = [extended.parameters[i] for i in candidate.indices]
     sized = [p.table.get("distribution") in MEASURED_FROM_NULL for p in parameters]
     indices = []
     for index, parameter, has_size in zip(candidate.indices, parameters, sized, strict=True):
         if has_size:
-            indices.append(found.add(_of_one_group(parameter, group, groups)))
+            indices.append(extended.add(_of_one_group(parameter, group, groups)))
         elif any(sized):
             indices.append(index)
         else:
             spread = float(np.std(np.asarray(parameter.prior.sample(jax.random.key(0), (PRIOR_DRAWS,)))))
-            indices.append(found.add(_difference(parameter.spec, spread, group, groups)))
+            indices.append(extended.add(_difference(parameter.spec, spread, group, groups)))
     return replace(candidate, indices=tuple(indices), group=group)
 
 
-def _one_sided(candidate: Candidate, found: _Space) -> bool:
+def _one_sided(candidate: Candidate, extended: _Space) -> bool:
     """Whether a size of a mechanism has one sign only, so that nothing added to it takes it away."""
-    specs = [found.parameters[i].spec for i in candidate.indices]
+    specs = [extended.parameters[i].spec for i in candidate.indices]
     return any(spec.low >= spec.nominal or spec.high <= spec.nominal for spec in specs)
 
 

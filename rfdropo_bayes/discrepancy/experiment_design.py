@@ -77,7 +77,7 @@ def outlooks(
         -own.error_slopes(np.repeat(fit.x[None], len(fit.free), axis=0), np.eye(len(fit.x))[fit.free])[0]
         for own, fit in zip(owns, models, strict=True)
     ]
-    found = []
+    outlooks_found = []
     for k in range(len(sequences)):
 
         def whiten(series: np.ndarray, k: int = k) -> np.ndarray:
@@ -96,10 +96,10 @@ def outlooks(
                 ]
                 pairs[(one.name, other.name)] = min(both)
         least = min(pairs.values(), default=0.0)
-        found.append(
+        outlooks_found.append(
             DesignOutlook(least, pairs, float(norm.cdf(0.5 * np.sqrt(least))), _information(base, jacobians[0]))
         )
-    return found
+    return outlooks_found
 
 
 def _misfit(
@@ -127,12 +127,12 @@ def best(outlook: Sequence[DesignOutlook], separating: bool) -> int:
 def at_hand(target: FitTarget, hypotheses: Sequence[Hypothesis]) -> dict[tuple[str, str], float]:
     """Lambda of each pair on the recordings at hand alone."""
     none = np.zeros((0, 1))
-    found = {}
+    misfits = {}
     for i, one in enumerate(hypotheses):
         for other in hypotheses[i + 1 :]:
             both = [
                 _misfit(b.fit, b.fit.residual - a.fit.residual, np.zeros(0), none.repeat(len(b.fit.free), axis=1))
                 for a, b in ((one, other), (other, one))
             ]
-            found[(one.name, other.name)] = min(both)
-    return found
+            misfits[(one.name, other.name)] = min(both)
+    return misfits

@@ -1,4 +1,4 @@
-"""One step of naming causes: a model is screened, the leading classes are refitted, and the best may join it."""
+"""One step of naming causes: a model is tested, the leading classes are refitted, and the best may join it."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from rfdropo_bayes.discrepancy.candidates import (
     fixed_drop,
     lead,
     probe_all,
-    screening_rollouts,
+    score_test_rollouts,
 )
 from rfdropo_bayes.discrepancy.deadline import about
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, best_between, climb, climb_rollouts, heights
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, best_between, heights, optimisation_rollouts, optimise
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.gain import noise_distance
-from rfdropo_bayes.discrepancy.inadequacy import as_measured, far_off
+from rfdropo_bayes.discrepancy.inadequacy import as_measured, misspecified
 from rfdropo_bayes.discrepancy.omnibus import Omnibus
 from rfdropo_bayes.discrepancy.score import likeness, project_out, span
-from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow, screen
+from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests, run_score_tests
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
@@ -84,17 +84,17 @@ class Added:
         fit: fit of the model with it.
         log_bayes_factor: log Bayes factor of the models with and without it, by Laplace.
         refits: log Bayes factors of all refitted candidates of this step.
-        judge: the target under which the fit was found, see `inadequacy`. It has the finer simulator from the step
+        fit_target: the target under which the fit was found, see `inadequacy`. It has the finer simulator from the step
             `DISCRETISATION` on.
     """
 
     name: str
     members: tuple[str, ...]
-    before: Screen
+    before: ScoreTests
     fit: Fit
     log_bayes_factor: float
     refits: dict[str, float]
-    judge: FitTarget
+    fit_target: FitTarget
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Refits:
         waiting: leading candidates without a refit.
     """
 
-    rows: tuple[ScreenRow, ...]
+    rows: tuple[ScoreRow, ...]
     drops: Mapping[str, float]
     fits: Mapping[str, Fit]
     waiting: tuple[str, ...]
@@ -158,7 +158,7 @@ class ExtensionSearch:
         """
         return len(self.candidates) if self.target.known is not None else self.rules.effects - steps
 
-    def screened(self, fit: Fit, without: Sequence[str] = ()) -> Screen:
+    def score_tests(self, fit: Fit, without: Sequence[str] = ()) -> ScoreTests:
         """Test a fit and its missing candidates.
 
         An error of mesh or time step that is too small to be named is not counted as a discrepancy: the residuals of
@@ -166,16 +166,16 @@ class ExtensionSearch:
         or if it moves the markers by less than the noise, see `_below_the_noise`.
         """
         # Some members of a family of parameters may be in the model already.
-        left = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
+        missing = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
         free = [
             c
-            for c, whole in zip(left, self.candidates, strict=True)
+            for c, whole in zip(missing, self.candidates, strict=True)
             if c.name not in without and (c.indices or not whole.indices)
         ]
         names = [c.name for c in free]
         finer = None
         clock, forward = self.target.forward.deadline, self.target.forward
-        count = screening_rollouts(self.target, free)
+        count = score_test_rollouts(self.target, free)
         apart = 0.0 if without else forward.compiling * forward.lanes.later
         self.report(f"score tests of {len(free)} candidates: {count} rollouts, {about(count * forward.pace + apart)}")
         with clock.stage("screening"):
@@ -187,19 +187,23 @@ class ExtensionSearch:
             probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
             names.append(DISCRETISATION)
         with clock.stage("joint test"):
-            found = screen(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer)
+            tests = run_score_tests(
+                self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, finer
+            )
             if self.target.known is not None:  # the joint test uses the noise of the measurement
-                return replace(found, omnibus=self._tested(fit, len(without)), finer=None)
-            if found.finer is None:
-                return found
-            seen = found.row(DISCRETISATION).adjusted_p <= self.rules.family
+                return replace(tests, omnibus=self._tested(fit, len(without)), finer=None)
+            if tests.finer is None:
+                return tests
+            seen = tests.row(DISCRETISATION).adjusted_p <= self.rules.family
             if seen and self._below_the_noise(fit):
                 exact = _without_numerical_error(fit, probes[-1])
-                again = screen(self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact)
-                found, seen = replace(found, finer=again.finer), False
-        if not seen and found.finer is not None:
-            found = replace(found, omnibus=max(found.omnibus, found.finer, key=lambda test: test.p))
-        return found
+                again = run_score_tests(
+                    self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact
+                )
+                tests, seen = replace(tests, finer=again.finer), False
+        if not seen and tests.finer is not None:
+            tests = replace(tests, omnibus=max(tests.omnibus, tests.finer, key=lambda test: test.p))
+        return tests
 
     def _below_the_noise(self, fit: Fit) -> bool:
         """Whether a finer mesh and time step move the markers by no more than the noise of one measurement.
@@ -211,41 +215,41 @@ class ExtensionSearch:
         shift = numerical_shift(self.target, self.finer, fit)
         return shift is not None and shift <= noise_distance(self.target.measured.noise.first)
 
-    def tested(self, fit: Fit, number: int) -> Screen:
-        """The joint test of a model, which screens no candidates and takes no rollouts."""
-        found = screen(self.target, fit, [], [], [self.seed, number], self.rules.bootstraps)
-        return replace(found, omnibus=self._tested(fit, number))
+    def tested(self, fit: Fit, number: int) -> ScoreTests:
+        """The joint test of a model, without tests of candidates and without rollouts."""
+        tests = run_score_tests(self.target, fit, [], [], [self.seed, number], self.rules.bootstraps)
+        return replace(tests, omnibus=self._tested(fit, number))
 
     def _tested(self, fit: Fit, number: int) -> Omnibus:
         """The joint test of a fit under the noise of the measurement."""
         known = self.target.measured
         measured = as_measured(self.target, fit)
-        return screen(known, measured, [], [], [self.seed, number], self.rules.bootstraps).omnibus
+        return run_score_tests(known, measured, [], [], [self.seed, number], self.rules.bootstraps).omnibus
 
-    def refits(self, found: Screen) -> Iterator[Refits]:
+    def refits(self, tests: ScoreTests) -> Iterator[Refits]:
         """The leading classes, one candidate refitted after the other; then the best of them from afar, see
-        `_from_afar`."""
-        significant = [row for row in found.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
-        if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(found.fit):
+        `_from_distant_starts`."""
+        significant = [row for row in tests.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
+        if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(tests.fit):
             significant = [row for row in significant if row.name != DISCRETISATION]
-        leads = {row.name: self._lead(found.fit, row) for row in significant}
+        leads = {row.name: self._lead(tests.fit, row) for row in significant}
         drops = {name: drop for name, (drop, _) in leads.items()}
-        leading = self._leading(significant, drops, found.fit)
+        leading = self._leading(significant, drops, tests.fit)
         if leading:
-            count = len(leading) * climb_rollouts(self.target, len(found.fit.free) + 1)
+            count = len(leading) * optimisation_rollouts(self.target, len(tests.fit.free) + 1)
             seconds = count * self.target.forward.pace
             self.report(f"refitting {len(leading)} leading candidates: up to {count} rollouts, {about(seconds)}")
         tried = Refits(tuple(significant), drops, {}, tuple(row.name for row in leading))
         yield tried
         for row in leading:
-            tried = tried.with_fit(row.name, self._refit(found.fit, row, leads[row.name][1]))
-            self.report(f"refit with {row.name}: log Bayes factor {tried.gains(found.fit)[row.name]:.1f}")
+            tried = tried.with_fit(row.name, self._refit(tests.fit, row, leads[row.name][1]))
+            self.report(f"refit with {row.name}: log Bayes factor {tried.gains(tests.fit)[row.name]:.1f}")
             yield tried
         for name in sorted(tried.fits, key=lambda name: -tried.fits[name].log_evidence)[: self.rules.classes]:
-            tried = tried.with_fit(name, self._from_afar(name, tried.fits[name]))
+            tried = tried.with_fit(name, self._from_distant_starts(name, tried.fits[name]))
             yield tried
 
-    def best(self, found: Screen, tried: Refits, further: bool) -> Added | None:
+    def best(self, tests: ScoreTests, tried: Refits, further: bool) -> Added | None:
         """The best of the refitted candidates with its class; None if no candidate is worth it.
 
         Args:
@@ -253,7 +257,7 @@ class ExtensionSearch:
             tried: the refits so far.
             further: whether the model has mechanisms already, so that another needs more evidence.
         """
-        gains = tried.gains(found.fit)
+        gains = tried.gains(tests.fit)
         price = np.log(len(self.candidates)) if further else 0.0
         worth = [name for name, gained in gains.items() if gained >= self.rules.evidence + price]
         if not worth:
@@ -263,27 +267,27 @@ class ExtensionSearch:
         able = [row for row in tried.rows if tried.drops[row.name] > enough]
         # Candidates with equal signatures near null may differ at their fitted size.
         able = [row for row in able if gains.get(row.name, np.inf) > gains[best] - TOLD_APART]
-        members = self._class_of(found.row(best), able)
+        members = self._class_of(tests.row(best), able)
         # A candidate of nearly equal gain is as likely a cause, for any signature.
         members += tuple(n for n in worth if n not in members and gains[n] > gains[best] - self.rules.evidence)
-        judge = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
-        return Added(best, members, found, tried.fits[best], gains[best], gains, judge)
+        fit_target = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
+        return Added(best, members, tests, tried.fits[best], gains[best], gains, fit_target)
 
-    def _lead(self, fit: Fit, row: ScreenRow) -> tuple[float, np.ndarray]:
+    def _lead(self, fit: Fit, row: ScoreRow) -> tuple[float, np.ndarray]:
         """See `lead`; a finer mesh has no parameter, and its effect only one size."""
         assert row.probe is not None
         if row.name == DISCRETISATION:
             return fixed_drop(fit, row.probe), fit.x
         return lead(self.target, fit, row.probe, row.lm)
 
-    def _leading(self, significant: Sequence[ScreenRow], drops: Mapping[str, float], fit: Fit) -> list[ScreenRow]:
+    def _leading(self, significant: Sequence[ScoreRow], drops: Mapping[str, float], fit: Fit) -> list[ScoreRow]:
         """The best candidates of the leading classes, and further members of these while there is room; candidates that
         cannot reach the required evidence are skipped, and candidates with slow rollouts come last.
         """
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
         able.sort(key=lambda row: row.rank * np.log(fit.counted) - drops[row.name])
-        heads: list[ScreenRow] = []
-        rest: list[ScreenRow] = []
+        heads: list[ScoreRow] = []
+        rest: list[ScoreRow] = []
         for row in able:
             assert row.probe is not None
             alike = any(likeness(row.probe.mark, h.probe.mark) > self.rules.class_cosine for h in heads if h.probe)
@@ -304,7 +308,7 @@ class ExtensionSearch:
         costly, parameters = self.target.forward.lanes.costly, self.target.forward.coordinates.space.parameters
         return any(parameters[index].physical in costly for index in candidate.indices)
 
-    def _class_of(self, best: ScreenRow, able: Sequence[ScreenRow]) -> tuple[str, ...]:
+    def _class_of(self, best: ScoreRow, able: Sequence[ScoreRow]) -> tuple[str, ...]:
         """The best candidate, and candidates of the same signature that explain the data equally well."""
         assert best.probe is not None
         alike = [
@@ -316,29 +320,29 @@ class ExtensionSearch:
         ]
         return (best.name, *alike)
 
-    def refit(self, fit: Fit, row: ScreenRow) -> Fit:
+    def refit(self, fit: Fit, row: ScoreRow) -> Fit:
         """The model of a fit with a candidate in it."""
         return self._refit(fit, row, self._lead(fit, row)[1])
 
-    def _refit(self, fit: Fit, row: ScreenRow, start: np.ndarray) -> Fit:
+    def _refit(self, fit: Fit, row: ScoreRow, start: np.ndarray) -> Fit:
         if row.name == DISCRETISATION:
             assert self.finer is not None
-            return climb(self.target.on(self.finer), start, fit.free)
+            return optimise(self.target.on(self.finer), start, fit.free)
         candidate = self.candidate(row.name)
         assert row.probe is not None
         assert candidate is not None
         free = np.array([*fit.free, *np.setdiff1d(candidate.indices, fit.free)], dtype=int)
         start = best_between(self.target, fit.x, start, list(row.probe.point), SHARES)
         if len(candidate.indices) == 1:
-            found = self._climbed_from_all_sizes(candidate.indices[0], fit.x, start, free)
+            refitted = self._optimised_from_all_sizes(candidate.indices[0], fit.x, start, free)
         else:
-            found = climb(self.target, start, free)
+            refitted = optimise(self.target, start, free)
         # The model without the candidate is a special case: a worse result is a failed optimisation.
-        if found.residual @ found.residual > fit.residual @ fit.residual:
-            found = max(found, climb(self.target, fit.x, free), key=lambda end: end.log_evidence)
-        return found
+        if refitted.residual @ refitted.residual > fit.residual @ fit.residual:
+            refitted = max(refitted, optimise(self.target, fit.x, free), key=lambda end: end.log_evidence)
+        return refitted
 
-    def _climbed_from_all_sizes(
+    def _optimised_from_all_sizes(
         self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
     ) -> Fit:
         """A fit with a candidate of one parameter, optimised from the best of its sizes until no other size is better.
@@ -346,13 +350,13 @@ class ExtensionSearch:
         The likelihood of a time shift has an optimum wherever jumps of commands meet the steps of the simulation or the
         rows of a recording; an optimisation from zero shift stops at one of them.
         """
-        found = climb(self.target, self._best_size(index, base, start), free)
+        fit = optimise(self.target, self._best_size(index, base, start), free)
         while True:
-            better = self._best_size(index, found.x, found.x)
-            again = found if np.array_equal(better, found.x) else climb(self.target, better, free)
-            if again.log_evidence <= found.log_evidence:
-                return found
-            found = again
+            better = self._best_size(index, fit.x, fit.x)
+            again = fit if np.array_equal(better, fit.x) else optimise(self.target, better, free)
+            if again.log_evidence <= fit.log_evidence:
+                return fit
+            fit = again
 
     def _best_size(
         self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"]
@@ -364,18 +368,18 @@ class ExtensionSearch:
         points[1:, index] = np.clip(coordinates.quantiles(index, SCANNED), *(end[index] for end in coordinates.bounds))
         return points[int(np.argmax(heights(self.target, points, "sizes")))]
 
-    def _from_afar(self, name: str, fit: Fit) -> Fit:
+    def _from_distant_starts(self, name: str, fit: Fit) -> Fit:
         """A fit with one amplitude that leaves most of a large misfit, or a better fit from the centre of the base
         parameters' priors. The base model's optimum, which compensates for the effect, may be in another basin than the
         joint optimum.
         """
         candidate = self.candidate(name)
-        if candidate is None or len(candidate.indices) != 1 or not far_off(self.target, fit.x):
+        if candidate is None or len(candidate.indices) != 1 or not misspecified(self.target, fit.x):
             return fit
         coordinates = self.target.forward.coordinates
         far = coordinates.prior_mean.copy()
         far[coordinates.base :] = fit.x[coordinates.base :]
-        best = climb(self.target, self._best_size(candidate.indices[0], far, far), fit.free)
+        best = optimise(self.target, self._best_size(candidate.indices[0], far, far), fit.free)
         if best.log_evidence <= fit.log_evidence:
             return fit
         self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")
@@ -408,6 +412,6 @@ def _without_numerical_error(fit: Fit, probe: Probe) -> Float[np.ndarray, " n"]:
     second order of the mesh. The error is therefore one to two times the change; the data determine the factor.
     """
     base = span(fit.jacobian)
-    change, left = project_out(base, probe.columns)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
-    share = np.clip(float(change @ left) / max(float(change @ change), 1e-300), 1.0, 2.0)
+    change, residual = project_out(base, probe.columns)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
+    share = np.clip(float(change @ residual) / max(float(change @ change), 1e-300), 1.0, 2.0)
     return fit.residual - share * probe.columns[:, 0]

@@ -42,7 +42,7 @@ TOLERANCE = 0.01  # predicted gain of a step [nat] at the end of an optimisation
 CLOSE = 1e-3  # of the squared misfit: optimisations end at steps with less than a thousandth of it
 SEARCHED = 3  # steps of an optimisation in a search: a linear model needs one or two, the demonstration's arm five
 # predicted gain [nat] at the end of a search's optimisations; the audit's own optimisation continues from there
-CLIMBED = 0.1
+OPTIMISED = 0.1
 POLLED = (0.3, 0.03, 0.003)  # trial deviations of the prior to each side of an optimum
 ALONG = (4.0, 2.0, 1.0, 0.3)  # trial deviations of the posterior along its principal axes
 WITHIN = 0.5 * max(ALONG) ** 2  # predicted gain [nat] of a step no longer than the trial steps
@@ -123,17 +123,17 @@ class FitTarget:
 
         def counted() -> Arrays:
             nonlocal looked_up
-            began, found, looked_up = time.monotonic(), compute(), False
+            began, result, looked_up = time.monotonic(), compute(), False
             seconds = np.asarray(time.monotonic() - began)
-            return {**found, "rollouts": np.asarray(self.forward.rollouts - before), "seconds": seconds}
+            return {**result, "rollouts": np.asarray(self.forward.rollouts - before), "seconds": seconds}
 
-        found = dict(self.journal.recall(digest(self.identity, what, *inputs), counted))
-        self.forward.rollouts = before + int(found.pop("rollouts"))
+        result = dict(self.journal.recall(digest(self.identity, what, *inputs), counted))
+        self.forward.rollouts = before + int(result.pop("rollouts"))
         self.forward.forget()
-        seconds = float(found.pop("seconds", 0.0))
+        seconds = float(result.pop("seconds", 0.0))
         if looked_up:
             self.forward.deadline.recall(seconds)
-        return found
+        return result
 
     def residual(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n m"]:
         """Whitened residuals, measured less simulated, of a batch of points."""
@@ -225,9 +225,9 @@ class FitTarget:
             return np.zeros((len(points), 0)), np.zeros((len(points), 0))
         sums = np.array([[name in entry.parameters for name in own.names] for entry in parts.entries], dtype=float)
         sd = np.array([entry.sd for entry in parts.entries])
-        left = (parts.measured - own.values(points) @ sums.T) / sd
+        residual = (parts.measured - own.values(points) @ sums.T) / sd
         along = np.zeros_like(points) if directions is None else own.slopes(points) * directions
-        return left, along @ sums.T / sd
+        return residual, along @ sums.T / sd
 
     def slopes(
         self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]
@@ -384,51 +384,51 @@ class Posterior(ProblemDefaults):
         )
 
 
-def climb(
+def optimise(
     target: FitTarget, start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"], *, evaluations: int = ALL
 ) -> Fit:
     """Posterior mode over the free coordinates from one start, the others held."""
 
     def compute() -> Arrays:
-        found = _climb(target, start, free, evaluations)
-        return {part.name: np.asarray(getattr(found, part.name)) for part in fields(Fit)}
+        stored = _optimise(target, start, free, evaluations)
+        return {part.name: np.asarray(getattr(stored, part.name)) for part in fields(Fit)}
 
-    found = target.recall("climb", [start, free, np.array(evaluations)], compute)
-    numbers = {name: float(found[name]) for name in ("log_evidence", "promise")}
-    return Fit(**{**found, **numbers})  # type: ignore[arg-type]
+    stored = target.recall("optimise", [start, free, np.array(evaluations)], compute)
+    numbers = {name: float(stored[name]) for name in ("log_evidence", "promise")}
+    return Fit(**{**stored, **numbers})  # type: ignore[arg-type]
 
 
-def _climb(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
+def _optimise(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
     """An optimisation, and the normal approximation at its end."""
     posterior = Posterior(target, start, free)
-    climbed = posterior.whole()
-    low, high = climbed.bounds
-    state, _ = maximise(climbed, np.clip(start[free], low, high), max_steps=evaluations, tolerance=TOLERANCE)
-    u, found = state.position, normal_at(climbed, state)
-    residual, jacobian = climbed.linearise(u)
-    spread = np.sqrt(np.diag(found.covariance))
+    optimised = posterior.whole()
+    low, high = optimised.bounds
+    state, _ = maximise(optimised, np.clip(start[free], low, high), max_steps=evaluations, tolerance=TOLERANCE)
+    u, approximation = state.position, normal_at(optimised, state)
+    residual, jacobian = optimised.linearise(u)
+    deviation = np.sqrt(np.diag(approximation.covariance))
     # Only part of a peak at a bound is inside.
-    inside = np.log(np.maximum(norm.cdf((high - u) / spread) - norm.cdf((low - u) / spread), 1e-12))
-    slope, _ = climbed.quadratic(u)
+    inside = np.log(np.maximum(norm.cdf((high - u) / deviation) - norm.cdf((low - u) / deviation), 1e-12))
+    slope, _ = optimised.quadratic(u)
     slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
-    promise = 0.5 * float(slope @ found.covariance @ slope) if np.isfinite(state.log_density) else np.inf
-    evidence = found.log_evidence + float(np.sum(inside)) + _over_sizes(target, residual)
-    return Fit(posterior.place(u[None])[0], free, residual, -jacobian, found.covariance, evidence, promise)
+    promise = 0.5 * float(slope @ approximation.covariance @ slope) if np.isfinite(state.log_density) else np.inf
+    evidence = approximation.log_evidence + float(np.sum(inside)) + _over_sizes(target, residual)
+    return Fit(posterior.place(u[None])[0], free, residual, -jacobian, approximation.covariance, evidence, promise)
 
 
 def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
     """Change of a log evidence [nat] by integrating over the size of a misspecified model's residuals; 0 at the assumed
     size.
     """
-    series, found = target.measurements.series(residual), 0.0
+    series, change = target.measurements.series(residual), 0.0
     for part, own in zip(target.noise.parts, target.measurements.columns, strict=True):
         if part.source == MISFIT:
             share = max(float(np.sum(series[..., own] ** 2)) / part.freedom, np.finfo(float).tiny)
-            found += 0.5 * part.freedom * (share - 1.0 - np.log(share))
-    return found
+            change += 0.5 * part.freedom * (share - 1.0 - np.log(share))
+    return change
 
 
-def climb_rollouts(target: FitTarget, parameters: int) -> int:
+def optimisation_rollouts(target: FitTarget, parameters: int) -> int:
     """Expected rollouts of an optimisation of ``parameters`` parameters."""
     forward, (_, values) = target.forward, optimisation_cost(0, 0)
     return forward.count * USUAL * (int(values) + forward.lanes.slope_rollouts * parameters)
@@ -438,14 +438,14 @@ def best_between(
     target: FitTarget,
     here: Float[np.ndarray, " d"],
     there: Float[np.ndarray, " d"],
-    held: Sequence[int],
+    constant: Sequence[int],
     shares: Float[np.ndarray, " share"],
 ) -> Float[np.ndarray, " d"]:
     """The best point, at some shares of the way, between one and a linear extrapolation from it, which a large misfit
     carries too far. Coordinates that are held, places and times, mean the same however large an effect is."""
     coordinates = target.forward.coordinates
     points = here + shares[:, None] * (there - here)
-    points[:, list(held)] = there[list(held)]
+    points[:, list(constant)] = there[list(constant)]
     points = np.clip(points, *coordinates.bounds)
     return points[int(np.argmax(heights(target, points, "shares")))]
 
@@ -453,8 +453,8 @@ def best_between(
 def heights(target: FitTarget, points: Float[np.ndarray, "n d"], what: str) -> Float[np.ndarray, " n"]:
     """Log posteriors of points, up to the noise's normaliser; stored in the journal under the name ``what``."""
 
-    found = target.recall(what, [points], lambda: {"height": target.log_likelihood(points)})
-    return found["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
+    stored = target.recall(what, [points], lambda: {"height": target.log_likelihood(points)})
+    return stored["height"] + target.forward.coordinates.log_prior(points).sum(axis=1)
 
 
 def widened(target: FitTarget, fit: Fit) -> Fit:
@@ -474,10 +474,10 @@ def widened(target: FitTarget, fit: Fit) -> Fit:
     if (factors == 1.0).all():
         return fit
     wide = target.on(target.forward.with_coordinates(own.widened(factors)))
-    found, unit = climb(wide, fit.x / factors, fit.free), factors[fit.free]
+    refitted, unit = optimise(wide, fit.x / factors, fit.free), factors[fit.free]
     target.forward.rollouts = wide.forward.rollouts
-    x = np.clip(factors * found.x, *own.bounds)  # which the product misses by its last bit
-    return replace(fit, x=x, covariance=found.covariance * np.outer(unit, unit), promise=found.promise)
+    x = np.clip(factors * refitted.x, *own.bounds)  # which the product misses by its last bit
+    return replace(fit, x=x, covariance=refitted.covariance * np.outer(unit, unit), promise=refitted.promise)
 
 
 def widening(fit: Fit, coordinates: Coordinates) -> Float[np.ndarray, " d"]:
@@ -506,7 +506,7 @@ def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"
 def _searching(target: FitTarget) -> LaplaceConfig:
     """Search settings of `calibrate`; rows of a body at rest are independent, and have one horizon."""
     rests = getattr(target.forward.lanes.simulator, "integrator", None) == QUASI_STATIC
-    return LaplaceConfig(tolerance=CLIMBED, blocks=1) if rests else LaplaceConfig(tolerance=CLIMBED)
+    return LaplaceConfig(tolerance=OPTIMISED, blocks=1) if rests else LaplaceConfig(tolerance=OPTIMISED)
 
 
 def optimum_rollouts(target: FitTarget) -> int:
@@ -515,8 +515,10 @@ def optimum_rollouts(target: FitTarget) -> int:
     """
     config, own = _searching(target), target.forward.coordinates
     beginning, step = optimisation_cost(own.base, 0)
-    climbs = sum(max(config.starts >> level, 1) for level in range(config.blocks))
-    return target.forward.count * int(config.blocks * config.prior_draws + climbs * (beginning + SEARCHED * step))
+    optimisations = sum(max(config.starts >> level, 1) for level in range(config.blocks))
+    return target.forward.count * int(
+        config.blocks * config.prior_draws + optimisations * (beginning + SEARCHED * step)
+    )
 
 
 def poll_rollouts(target: FitTarget) -> int:
@@ -537,8 +539,8 @@ def with_usable_differences(target: FitTarget, x: Float[np.ndarray, " d"]) -> Fi
 
     def slope(step: float) -> np.ndarray:
         points = np.clip(np.concatenate([x + step * directions, x - step * directions]), *coordinates.bounds)
-        found = target.recall("ladder", [points], lambda: {"residual": target.residual(points)})["residual"]
-        ahead, behind = np.split(found, 2)
+        residuals = target.recall("ladder", [points], lambda: {"residual": target.residual(points)})["residual"]
+        ahead, behind = np.split(residuals, 2)
         return (ahead - behind) / (2.0 * step)
 
     step = usable_difference(slope)

@@ -75,7 +75,7 @@ def families(specs: Sequence[ParameterSpec]) -> list[list[ParameterSpec]]:
     for spec in specs:
         key = repr((spec.unit, spec.low, spec.high, sorted(spec.prior.items())))
         alike.setdefault(spec.family or key, []).append(spec)
-    return [found for found in alike.values() if found[0].family or (len(found) > 1 and stem(found))]
+    return [members for members in alike.values() if members[0].family or (len(members) > 1 and stem(members))]
 
 
 def stem(specs: Sequence[ParameterSpec]) -> str:

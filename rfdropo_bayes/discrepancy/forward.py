@@ -70,8 +70,8 @@ class Forward:
     def identity(self) -> str:
         """Digest of the simulator, its parameters with their priors, and the commands."""
         own, simulator = self.coordinates, self.lanes.simulator
-        held = sorted(own.space.fixed.items()), sorted(own.nominal.items())
-        named = (simulator.description, own.names, own.base, *held)
+        values = sorted(own.space.fixed.items()), sorted(own.nominal.items())
+        named = (simulator.description, own.names, own.base, *values)
         scale = own.values(np.stack([np.zeros(len(own.names)), np.ones(len(own.names))]))
         prior = (own.prior_mean, own.prior_sd, *own.bounds)
         return digest(
@@ -121,17 +121,17 @@ class Forward:
         began = time.monotonic()
         every = self.commands.step.shape[1]
         steps = None if rows is None else min(int(self.commands.sample_step[:, :rows].max()) + 1, every)
-        found, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check, steps)
+        fields, status = self.lanes.roll(flat[once], start[once], commands.of(once), self.deadline.check, steps)
         # A call that is not full is filled with copies, which cost one engine nothing and the other as much as ever.
         if steps is None and len(status) >= self.lanes.width:
             self.pace = (time.monotonic() - began) / (-(-len(status) // self.lanes.width) * self.lanes.width)
         self.rollouts += len(status)
-        status, found = status[again], {name: part[again] for name, part in found.items()}
-        found = self._as_seen(found, theta, points)
+        status, fields = status[again], {name: part[again] for name, part in fields.items()}
+        fields = self._as_seen(fields, theta, points)
         fine = status == Result.OK
         for name in self.lanes.fields:
-            fine &= np.isfinite(found[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
-        shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in found.items()}
+            fine &= np.isfinite(fields[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
+        shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in fields.items()}
         shown |= {"offset": self._offset(theta), **self.coordinates.gains(points)}
         fine = fine.reshape(len(points), -1).all(axis=1)
         if rows is None and len(points) <= KEPT:
@@ -144,11 +144,11 @@ class Forward:
         Raises:
             NoLikelihoodError: a rollout failed.
         """
-        found, fine = self.observe(point[None])
+        fields, fine = self.observe(point[None])
         if not fine[0]:
             words = "a rollout at the optimum failed"
             raise NoLikelihoodError(words, where="audit", remedy=Result.DIVERGED.remedy)
-        return {name: part[0] for name, part in found.items()}
+        return {name: part[0] for name, part in fields.items()}
 
     def tangents(self, points: Points, directions: Points) -> Fields:
         """Derivatives of `observe` for data fields along a direction at each point; one-sided for one-sided mechanisms
@@ -156,8 +156,8 @@ class Forward:
         """
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
         step = self._difference
-        found = self._exact(points, tangent) if step is None else self._differences(points, directions, step)
-        return found | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
+        derivatives = self._exact(points, tangent) if step is None else self._differences(points, directions, step)
+        return derivatives | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
 
     @property
     def _difference(self) -> float | None:
@@ -171,12 +171,12 @@ class Forward:
         # Recordings that a direction does not affect, such as another group's, are unchanged.
         moved = np.flatnonzero(along.any(axis=1))
         moved = moved if len(moved) else np.arange(1)
-        found = self.lanes.differentiate(
+        derivatives = self.lanes.differentiate(
             flat[moved], along[moved], start[moved], commands.of(moved), self.deadline.check
         )
         self.rollouts += self.lanes.slope_rollouts * len(moved)
         shown = {}
-        for name, part in found.items():
+        for name, part in derivatives.items():
             every = np.zeros((len(flat), *part.shape[1:]))
             every[moved] = np.nan_to_num(part)
             shown[name] = every.reshape(len(points), self.count, *part.shape[1:])
@@ -202,19 +202,19 @@ class Forward:
         return shown
 
     def _offset(self, theta: np.ndarray) -> np.ndarray:
-        found = np.zeros((*theta.shape[:2], 3))
+        offset = np.zeros((*theta.shape[:2], 3))
         for axis, name in enumerate(OFFSETS):
             if name in self.lanes.physical:
-                found[..., axis] = theta[..., self.lanes.physical.index(name)]
-        return found
+                offset[..., axis] = theta[..., self.lanes.physical.index(name)]
+        return offset
 
     def _beside(self, points: Points) -> Float[np.ndarray, "n k"]:
         """Further inputs of a rollout beside the simulator's parameters."""
         return np.zeros((len(points), 0))
 
-    def _as_seen(self, found: Fields, theta: np.ndarray, points: Points) -> Fields:
+    def _as_seen(self, fields: Fields, theta: np.ndarray, points: Points) -> Fields:
         """Measured fields from the observations of rollouts, one row per lane."""
-        return found
+        return fields
 
     def _per_lane(self, theta: np.ndarray, points: Points) -> tuple[np.ndarray, np.ndarray, Commands]:
         """Parameters (point, recording, physical), starts and commands of each lane."""

@@ -167,8 +167,8 @@ def measure_gain(
     pattern: Float[np.ndarray, "group time column"],
     rng: np.random.Generator,
     *,
-    judge: Stacked | None = None,
-    spread: Float[np.ndarray, " column"] | None = None,
+    noise_of_fit: Stacked | None = None,
+    deviation: Float[np.ndarray, " column"] | None = None,
 ) -> Gain:
     """Compare two models.
 
@@ -179,12 +179,12 @@ def measure_gain(
         pattern: whitened residuals of the base model on its fitted data: the discrepancy's distribution over
             frequencies and columns.
         rng: random generator of the interval.
-        judge: noise model for the fit and the densities of the base model; the measurements' noise by default.
+        noise_of_fit: noise model for the fit and the densities of the base model; the measurements' noise by default.
         spread: deviation of the extended model's errors, for its bands; the noise's by default.
     """
     first, second = (np.where(unseen.valid, p.mean, 0.0) for p in (base, extended))
-    distances = np.array([_distances(unseen, left) for left in (first, second)])
-    own = [_elpd(unseen, p, judge or noise) for p in (base, extended)]
+    distances = np.array([_distances(unseen, errors) for errors in (first, second)])
+    own = [_elpd(unseen, p, noise_of_fit or noise) for p in (base, extended)]
     difference = own[1] - own[0]
     count = len(difference)
     explained, interval = explained_fraction(unseen, first, second, noise, pattern, rng)
@@ -197,7 +197,7 @@ def measure_gain(
         elpd_difference=float(difference.sum()),
         elpd_difference_se=float(np.sqrt(count) * difference.std(ddof=1)) if count >= DIFFERENCE_FROM else None,
         elpd_p=sign_flip_p(difference, rng) if count >= DIFFERENCE_FROM else None,
-        coverage=_coverage(unseen, extended, noise.scale if spread is None else spread),
+        coverage=_coverage(unseen, extended, noise.scale if deviation is None else deviation),
         explained=explained,
         interval=interval,
         floor=noise_distance(noise.first),
@@ -205,10 +205,10 @@ def measure_gain(
     )
 
 
-def _distances(unseen: Unseen, left: Float[np.ndarray, "trajectory time column"]) -> Float[np.ndarray, " trajectory"]:
+def _distances(unseen: Unseen, errors: Float[np.ndarray, "trajectory time column"]) -> Float[np.ndarray, " trajectory"]:
     """Root mean square distance of a marker [m], of each trajectory."""
     markers = np.maximum(unseen.valid[..., : unseen.markers].sum(axis=(1, 2)) / 3.0, 1.0)
-    return np.sqrt(np.sum(left[..., : unseen.markers] ** 2, axis=(1, 2)) / markers)
+    return np.sqrt(np.sum(errors[..., : unseen.markers] ** 2, axis=(1, 2)) / markers)
 
 
 def sign_flip_p(difference: Float[np.ndarray, " n"], rng: np.random.Generator) -> float:
@@ -239,8 +239,8 @@ def _elpd(unseen: Unseen, prediction: UnseenErrors, noise: Stacked) -> Float[np.
     return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
 
 
-def _coverage(unseen: Unseen, prediction: UnseenErrors, spread: Float[np.ndarray, " column"]) -> dict[float, float]:
-    whole = np.sqrt(prediction.errors.var(axis=0) + spread**2)
+def _coverage(unseen: Unseen, prediction: UnseenErrors, deviation: Float[np.ndarray, " column"]) -> dict[float, float]:
+    whole = np.sqrt(prediction.errors.var(axis=0) + deviation**2)
     z = (np.abs(prediction.mean) / whole)[unseen.valid]
     return {level: float(np.mean(z < norm.ppf(0.5 + level / 2))) for level in LEVELS}
 
@@ -261,7 +261,7 @@ def explained_fraction(
     count little.
 
     The interval includes the common noise in both mean squares, the uncertainty of its power at these frequencies and,
-    from `SPREAD_FROM` trajectories up, the variation of the fraction between trajectories (`_spread_between`).
+    from `SPREAD_FROM` trajectories up, the variation of the fraction between trajectories (`_deviation_between`).
     """
     count = len(unseen.valid)
     sums, floors, drawn, expected = np.zeros((2, count)), np.zeros(count), np.zeros((RESAMPLES, 2)), np.zeros(RESAMPLES)
@@ -282,13 +282,13 @@ def explained_fraction(
         floors += least
     total, floor = sums.sum(axis=1), floors.sum()
     point = float(_fraction(total[0], total[1], floor, floor))
-    found = _fraction(total[0] + drawn[:, 0], total[1] + drawn[:, 1], expected, floor)
-    low, high = (float(np.quantile(found, level)) for level in (0.05, 0.95))
-    apart = _spread_between(sums, floors)
+    fractions = _fraction(total[0] + drawn[:, 0], total[1] + drawn[:, 1], expected, floor)
+    low, high = (float(np.quantile(fractions, level)) for level in (0.05, 0.95))
+    apart = _deviation_between(sums, floors)
     return point, (min(low, point - apart), max(high, min(point + apart, 1.0)))
 
 
-def _spread_between(sums: Float[np.ndarray, "2 trajectory"], floors: Float[np.ndarray, " trajectory"]) -> float:
+def _deviation_between(sums: Float[np.ndarray, "2 trajectory"], floors: Float[np.ndarray, " trajectory"]) -> float:
     """Half the 90 % interval of the fraction of all recordings like these: 0 for fewer than `SPREAD_FROM`.
 
     Student's t about the jackknife's standard error (Miller 1974, Biometrika 61:1-15): each trajectory is left out in
@@ -322,9 +322,9 @@ def _noise_in_sums(
 def _fraction(
     base: np.ndarray, extended: np.ndarray, expected: np.ndarray | float, floor: np.ndarray | float
 ) -> np.ndarray:
-    left = np.maximum(extended - expected, 0.0)
+    remaining = np.maximum(extended - expected, 0.0)
     # Less than the noise's own uncertainty is no discrepancy to be explained.
-    return 1.0 - left / np.maximum(base - expected, 1e-3 * floor)
+    return 1.0 - remaining / np.maximum(base - expected, 1e-3 * floor)
 
 
 def _floor_error(noise: Autoregression, weight: Float[np.ndarray, " row"]) -> float:

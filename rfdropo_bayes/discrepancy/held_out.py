@@ -13,9 +13,9 @@ from jaxtyping import Bool
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, measure_gain
-from rfdropo_bayes.discrepancy.inadequacy import as_measured, spread
+from rfdropo_bayes.discrepancy.inadequacy import as_measured, residual_deviation
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.discrepancy.naming import Named
 from rfdropo_bayes.discrepancy.port_rollouts import with_laws_of
@@ -49,8 +49,8 @@ class HeldOut:
         predictions: predictions of the base model, then after each step.
         patterns: residuals of each model on its fitted data, see `measure_gain`.
         noise: noise of the measurements.
-        judges: noise model of each model, see `inadequacy`.
-        spreads: deviation of each model's residuals, by column.
+        noise_models: noise model of each model, see `inadequacy`.
+        deviations: deviation of each model's residuals, by column.
         seed: seed of the gain's interval.
     """
 
@@ -59,8 +59,8 @@ class HeldOut:
     predictions: list[UnseenErrors]
     patterns: list[np.ndarray]
     noise: Stacked
-    judges: list[Stacked]
-    spreads: list[np.ndarray]
+    noise_models: list[Stacked]
+    deviations: list[np.ndarray]
     seed: int
 
     @property
@@ -74,13 +74,15 @@ class HeldOut:
 
     def beside(self, other: HeldOut) -> Gain:
         """Gain of the last model over the last model of another sequence of steps."""
-        rng, judge, pattern = np.random.default_rng([self.seed, 4]), other.judges[-1], other.patterns[-1]
-        first, second, spread = other.predictions[-1], self.predictions[-1], self.spreads[-1]
-        return measure_gain(self.unseen, first, second, self.noise, pattern, rng, judge=judge, spread=spread)
+        rng, noise_of_fit, pattern = np.random.default_rng([self.seed, 4]), other.noise_models[-1], other.patterns[-1]
+        first, second, deviation = other.predictions[-1], self.predictions[-1], self.deviations[-1]
+        return measure_gain(
+            self.unseen, first, second, self.noise, pattern, rng, noise_of_fit=noise_of_fit, deviation=deviation
+        )
 
     def after(self, steps: int) -> HeldOut:
         """The predictions of the base model and of at most ``steps`` steps."""
-        parts = ("predictions", "patterns", "judges", "spreads")
+        parts = ("predictions", "patterns", "noise_models", "deviations")
         return replace(self, **{name: getattr(self, name)[: steps + 1] for name in parts})
 
     def supported(self) -> int:
@@ -96,28 +98,28 @@ class HeldOut:
         return last
 
 
-class JudgedModel(NamedTuple):
+class FittedModel(NamedTuple):
     """A model that predicts unseen recordings.
 
     Attributes:
-        judge: target of its fit.
+        fit_target: target of its fit.
         fit: its fit.
         finer: whether it runs on the finer simulator.
     """
 
-    judge: FitTarget
+    fit_target: FitTarget
     fit: Fit
     finer: bool
 
 
-def stages_of(judge: FitTarget, base: Fit, steps: Sequence[Added]) -> list[JudgedModel]:
+def stages_of(fit_target: FitTarget, base: Fit, steps: Sequence[Added]) -> list[FittedModel]:
     """The base model, and the model after each step."""
     names = [step.name for step in steps]
-    after = [JudgedModel(step.judge, step.fit, DISCRETISATION in names[: k + 1]) for k, step in enumerate(steps)]
-    return [JudgedModel(judge, base, False), *after]
+    after = [FittedModel(step.fit_target, step.fit, DISCRETISATION in names[: k + 1]) for k, step in enumerate(steps)]
+    return [FittedModel(fit_target, base, False), *after]
 
 
-def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedModel]) -> HeldOut:
+def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[FittedModel]) -> HeldOut:
     """Predictions of models; ``target`` has the measurement's noise.
 
     A model with a failed rollout of an unseen recording gives no prediction, and later models are not evaluated.
@@ -126,23 +128,26 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[JudgedM
         NoLikelihoodError: the first model's rollout fails.
     """
     count, every = len(problem.trajectories), len(problem.model.recordings.names)
-    fits, judges = [stage.fit for stage in stages], [stage.judge for stage in stages]
+    fits, fit_targets = [stage.fit for stage in stages], [stage.fit_target for stage in stages]
     if every > count:
         which = "test recordings"
         tested = measurements_of(problem, range(count, every))
         unseen = _unseen(tested, tested.valid, problem.model.recordings.names[count:])
         predictions = list[UnseenErrors]()
         with _up_to_the_last(predictions):
-            for judge, fit, finer in stages:
-                forward = with_laws_of(judge.forward, simulated(problem, finer, tested, range(count, every)))
+            for fit_target, fit, finer in stages:
+                forward = with_laws_of(fit_target.forward, simulated(problem, finer, tested, range(count, every)))
                 own = replace(target, forward=forward, measurements=tested)
                 predictions.append(_predict(own, fit, [problem.seed, 3]))
     else:
-        which, unseen, predictions = _left_out(problem, judges, target, fits)
-    stages, judges = stages[: len(predictions)], judges[: len(predictions)]
-    patterns = [target.measurements.series(as_measured(judge, fit).residual) for judge, fit, _ in stages]
-    spreads, noises = [spread(judge, fit) for judge, fit, _ in stages], [judge.noise for judge in judges]
-    return HeldOut(which, unseen, predictions, patterns, target.noise, noises, spreads, problem.seed)
+        which, unseen, predictions = _left_out(problem, fit_targets, target, fits)
+    stages, fit_targets = stages[: len(predictions)], fit_targets[: len(predictions)]
+    patterns = [target.measurements.series(as_measured(fit_target, fit).residual) for fit_target, fit, _ in stages]
+    deviations, noises = (
+        [residual_deviation(fit_target, fit) for fit_target, fit, _ in stages],
+        [each.noise for each in fit_targets],
+    )
+    return HeldOut(which, unseen, predictions, patterns, target.noise, noises, deviations, problem.seed)
 
 
 @contextmanager
@@ -162,7 +167,7 @@ def _unseen(tested: Measurements, valid: np.ndarray, recordings: Sequence[str]) 
 
 
 def _left_out(
-    problem: AuditProblem, judges: Sequence[FitTarget], target: FitTarget, fits: Sequence[Fit]
+    problem: AuditProblem, fit_targets: Sequence[FitTarget], target: FitTarget, fits: Sequence[Fit]
 ) -> tuple[str, Unseen, list[UnseenErrors]]:
     """Predict each group of repeats from the others. If a group has parameters that no other determines (as a single
     group has), predict the later rows of all from the earlier rows in motion, and at rest each block of poses from the
@@ -182,13 +187,13 @@ def _left_out(
         masks = [later_rows(measured.valid)[:, :, None]]
     parts = list[list[np.ndarray]]()
     with _up_to_the_last(parts):
-        for judge, fit in zip(judges, fits, strict=True):
+        for fit_target, fit in zip(fit_targets, fits, strict=True):
             row = list[np.ndarray]()
             for mask in masks:
-                count = np.where(mask, 0.0, judge.measurements.count)
-                kept = replace(judge.measurements, count=count)
-                refitted = climb(replace(judge, measurements=kept), fit.x, fit.free, evaluations=15)
-                row.append(_predict(target.on(judge.forward), refitted, [problem.seed, 3]).errors)
+                count = np.where(mask, 0.0, fit_target.measurements.count)
+                kept = replace(fit_target.measurements, count=count)
+                refitted = optimise(replace(fit_target, measurements=kept), fit.x, fit.free, evaluations=15)
+                row.append(_predict(target.on(fit_target.forward), refitted, [problem.seed, 3]).errors)
             parts.append(row)
     draws = min(len(part) for row in parts for part in row)
     predictions = []
@@ -246,7 +251,7 @@ def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
         if held_out.count <= len(named.steps):
             last = named.steps[held_out.count - 1]
             report(f"with {last.name}, an unseen recording cannot be simulated: it is not supported")
-            fewer = replace(named, steps=named.steps[: held_out.count - 1], screen=last.before, tried=None)
+            fewer = replace(named, steps=named.steps[: held_out.count - 1], tests=last.before, tried=None)
         else:
             fewer = named
         supported = held_out.supported()
@@ -255,12 +260,12 @@ def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
             return
         if supported < len(fewer.steps):
             before = fewer.steps[supported].before
-            fewer = replace(fewer, steps=fewer.steps[:supported], screen=before, tried=None)
+            fewer = replace(fewer, steps=fewer.steps[:supported], tests=before, tried=None)
         yield _kept(named, fewer, held_out.after(supported))
-        left, measured = _without_carried(problem, fewer, held_out.after(supported))
-        if len(left.steps) < len(fewer.steps):
-            left = replace(left, screen=left.asked.tested(left.fit, len(left.steps)))
-        yield _kept(named, left, measured)
+        remaining, measured = _without_carried(problem, fewer, held_out.after(supported))
+        if len(remaining.steps) < len(fewer.steps):
+            remaining = replace(remaining, tests=remaining.asked.tested(remaining.fit, len(remaining.steps)))
+        yield _kept(named, remaining, measured)
 
 
 def _kept(asked: Named, named: Named, held_out: HeldOut | None) -> Kept:
@@ -289,4 +294,4 @@ def _without_carried(problem: AuditProblem, named: Named, held_out: HeldOut) -> 
 
 def _predicted(problem: AuditProblem, named: Named) -> HeldOut:
     """Predictions of the base model and of the model after each step."""
-    return predicted(problem, named.judge.measured, stages_of(named.search.target, named.base, named.steps))
+    return predicted(problem, named.fit_target.measured, stages_of(named.search.target, named.base, named.steps))

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, MISFIT, RESIDUALS
 from rfdropo_bayes.bayes.noise.stacked import Stacked
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
 from rfdropo_bayes.inference import lasting_series
 
 POOR = 2.0  # squared residual per value, in the noise's variance, above which a model is misspecified
@@ -27,7 +27,7 @@ SETTLED = 0.1  # relative change of the noise between rounds
 QUICK = 0.5  # share that the rows before predict, up to which residuals beside a misspecified model are noise
 
 
-def far_off(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
+def misspecified(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
     """Whether a model leaves more than `POOR` times the variance of the measurement's noise."""
     known = target.measured
     if known.noise.source == RESIDUALS:  # of the model itself
@@ -36,7 +36,7 @@ def far_off(target: FitTarget, x: Float[np.ndarray, " d"]) -> bool:
     return bool(residual @ residual > POOR * np.count_nonzero(residual))
 
 
-def leaves_noise(before: Stacked, left: Stacked) -> bool:
+def leaves_noise(before: Stacked, after: Stacked) -> bool:
     """Whether residuals of an extended model are noise.
 
     Poses that follow each other closely make any misfit slow. An autoregression would explain what is left of it, and
@@ -46,80 +46,82 @@ def leaves_noise(before: Stacked, left: Stacked) -> bool:
         before: noise beside the base model.
         left: noise beside the extended model.
     """
-    if left.source == INNOVATIONS:
+    if after.source == INNOVATIONS:
         return False
-    return before.source != INNOVATIONS or max(part.remembered for part in left.parts) <= QUICK
+    return before.source != INNOVATIONS or max(part.remembered for part in after.parts) <= QUICK
 
 
 def fit_with_noise(
     known: FitTarget, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
 ) -> tuple[FitTarget, Fit]:
     """The target with a model's noise, and its fit, optimised from a point."""
-    if not far_off(known, x):
-        return known, climb(known, x, free)
-    judge = _under(known, known.errors(x))
+    if not misspecified(known, x):
+        return known, optimise(known, x, free)
+    fit_target = _under(known, known.errors(x))
     for _ in range(ROUNDS):
-        fit = climb(judge, x, free)
-        if not far_off(known, fit.x):
-            return known, climb(known, fit.x, free)
-        before, x = judge, fit.x
-        judge = _under(known, _errors(judge, fit.residual), _shares(judge, fit))
-        if np.all(np.abs(judge.noise.scale / before.noise.scale - 1.0) < SETTLED):
+        fit = optimise(fit_target, x, free)
+        if not misspecified(known, fit.x):
+            return known, optimise(known, fit.x, free)
+        before, x = fit_target, fit.x
+        fit_target = _under(known, _errors(fit_target, fit.residual), _shares(fit_target, fit))
+        if np.all(np.abs(fit_target.noise.scale / before.noise.scale - 1.0) < SETTLED):
             break
-    return judge, climb(judge, x, free)
+    return fit_target, optimise(fit_target, x, free)
 
 
-def as_measured(judge: FitTarget, fit: Fit) -> Fit:
+def as_measured(fit_target: FitTarget, fit: Fit) -> Fit:
     """A fit with residuals and slopes in deviations of the measurement's noise; its covariance stays."""
-    return fit if judge.known is None else seen_under(judge, judge.known, fit)
+    return fit if fit_target.known is None else seen_under(fit_target, fit_target.known, fit)
 
 
-def seen_under(judge: FitTarget, other: FitTarget, fit: Fit) -> Fit:
+def seen_under(fit_target: FitTarget, other: FitTarget, fit: Fit) -> Fit:
     """A fit with residuals and slopes in deviations of the noise of another target; its covariance stays. A fit under
     the measurement noise is unchanged.
     """
-    if judge.known is None or judge.noise is other.noise:
+    if fit_target.known is None or fit_target.noise is other.noise:
         return fit
 
     def whitened(white: np.ndarray) -> np.ndarray:
         weighed = white[..., other.measurements.count.size :]
-        return np.concatenate([rewhitened(judge, other, white), weighed], axis=-1)
+        return np.concatenate([rewhitened(fit_target, other, white), weighed], axis=-1)
 
     promise = fit.promise if fit.converged else np.inf
     return replace(fit, residual=whitened(fit.residual), jacobian=whitened(fit.jacobian.T).T, promise=promise)
 
 
 def rewhitened(
-    judge: FitTarget, other: FitTarget, white: Float[np.ndarray, "*batch n"]
+    fit_target: FitTarget, other: FitTarget, white: Float[np.ndarray, "*batch n"]
 ) -> Float[np.ndarray, "*batch m"]:
-    """Residuals of the channels under the white noise of ``judge``, in deviations of the noise of another target."""
-    return other.measurements.whiten(_errors(judge, white), other.noise)
+    """Residuals under the white noise of ``fit_target``, in deviations of the noise of another target."""
+    return other.measurements.whiten(_errors(fit_target, white), other.noise)
 
 
-def judged_anew(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
+def noise_updated(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
     """Target and fit of an improved model: if it was misspecified, refitted under noise of its present residuals."""
     return (target, fit) if target.known is None else fit_with_noise(target.known, fit.x, fit.free)
 
 
-def noise_share(judge: FitTarget) -> float:
-    """Mean square of the measurement's noise in deviations of the noise of ``judge``; 1 if the model is not
+def noise_share(fit_target: FitTarget) -> float:
+    """Mean square of the measurement's noise in deviations of the noise of ``fit_target``; 1 if the model is not
     misspecified.
     """
-    if judge.known is None:
+    if fit_target.known is None:
         return 1.0
-    known = judge.known.measurements
-    variance = (judge.known.noise.scale / judge.noise.scale) ** 2 / np.maximum(known.count, 1.0)
+    known = fit_target.known.measurements
+    variance = (fit_target.known.noise.scale / fit_target.noise.scale) ** 2 / np.maximum(known.count, 1.0)
     return float(np.mean(variance[known.valid]))
 
 
-def spread(judge: FitTarget, fit: Fit) -> Float[np.ndarray, " column"]:
+def residual_deviation(fit_target: FitTarget, fit: Fit) -> Float[np.ndarray, " column"]:
     """Deviation of a fit's residuals for each column: the measurement noise, unless the model is misspecified."""
-    return judge.noise.scale if judge.known is None else _sizes(judge, _errors(judge, fit.residual))
+    return fit_target.noise.scale if fit_target.known is None else _sizes(fit_target, _errors(fit_target, fit.residual))
 
 
-def _errors(judge: FitTarget, white: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch group time column"]:
-    """Errors whose residuals under the white noise of ``judge`` are ``white``."""
-    return judge.measurements.series(white) * judge.noise.scale
+def _errors(
+    fit_target: FitTarget, white: Float[np.ndarray, "*batch n"]
+) -> Float[np.ndarray, "*batch group time column"]:
+    """Errors whose residuals under the white noise of ``fit_target`` are ``white``."""
+    return fit_target.measurements.series(white) * fit_target.noise.scale
 
 
 def _sizes(target: FitTarget, errors: Float[np.ndarray, "group time column"]) -> Float[np.ndarray, " column"]:
@@ -130,11 +132,11 @@ def _sizes(target: FitTarget, errors: Float[np.ndarray, "group time column"]) ->
     return sizes
 
 
-def _shares(judge: FitTarget, fit: Fit) -> list[float]:
+def _shares(fit_target: FitTarget, fit: Fit) -> list[float]:
     """Weight of a row of each channel, see `lasting_series`."""
-    measured = judge.measurements
-    errors = _errors(judge, fit.residual)
-    series = np.where(measured.valid, errors / _sizes(judge, errors), 0.0)
+    measured = fit_target.measurements
+    errors = _errors(fit_target, fit.residual)
+    series = np.where(measured.valid, errors / _sizes(fit_target, errors), 0.0)
     reach = measured.series((fit.jacobian @ np.linalg.cholesky(fit.covariance)).T)
     steps = measured.steps
     return [

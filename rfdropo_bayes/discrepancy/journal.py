@@ -23,14 +23,14 @@ Arrays = dict[str, np.ndarray]
 
 def digest(*parts: Any) -> str:
     """SHA-256 of arrays (shape, type and bytes) and of the text of everything else."""
-    found = hashlib.sha256(__version__.encode())
+    hashed = hashlib.sha256(__version__.encode())
     for part in parts:
         if isinstance(part, np.ndarray):
-            found.update(f"{part.shape}{part.dtype}".encode())
-            found.update(np.ascontiguousarray(part).tobytes())
+            hashed.update(f"{part.shape}{part.dtype}".encode())
+            hashed.update(np.ascontiguousarray(part).tobytes())
         else:
-            found.update(repr(part).encode())
-    return found.hexdigest()
+            hashed.update(repr(part).encode())
+    return hashed.hexdigest()
 
 
 class Journal:

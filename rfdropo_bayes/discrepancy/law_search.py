@@ -20,8 +20,8 @@ from jaxtyping import Float
 
 from rfdropo_bayes.discrepancy.deadline import OutOfTime
 from rfdropo_bayes.discrepancy.differences import Groups
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb
-from rfdropo_bayes.discrepancy.inadequacy import judged_anew
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
+from rfdropo_bayes.discrepancy.inadequacy import noise_updated
 from rfdropo_bayes.discrepancy.port_evidence import PortEvidence, evidences
 from rfdropo_bayes.discrepancy.port_responses import (
     Responses,
@@ -41,7 +41,7 @@ from rfdropo_bayes.discrepancy.port_rollouts import (
     coefficient_name,
     placed,
 )
-from rfdropo_bayes.discrepancy.screen import null_residuals
+from rfdropo_bayes.discrepancy.score_tests import null_residuals
 from rfdropo_bayes.mechanisms.features import Feature, dictionary, own_dictionary
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
 
@@ -123,7 +123,7 @@ class Refit:
 
 
 @dataclass(frozen=True)
-class FoundLaw:
+class LawResult:
     """Result of the search for laws around one model.
 
     Attributes:
@@ -134,7 +134,8 @@ class FoundLaw:
         afterwards: largest log evidence of any port after each term.
         centre: times of the ports' signals [s] from the recordings' first rows on; for recordings with different
             lead-in times, from their median.
-        gate: null quantile of the first term's gain on left-out recordings [nat]; None if no port is significant.
+        null_quantile: null quantile of the first term's gain on left-out recordings [nat]; None if no port is
+        significant.
         offered: largest gain [nat] of any feature at any port before the first term; 0 without any gain.
     """
 
@@ -144,7 +145,7 @@ class FoundLaw:
     ties: list[Refit]
     afterwards: list[PortEvidence]
     centre: Float[np.ndarray, " spline"]
-    gate: float | None
+    null_quantile: float | None
     offered: float
 
     @property
@@ -157,12 +158,12 @@ class FoundLaw:
         """Largest log evidence of any port once the law is in the model; None without a law."""
         return self.afterwards[-1] if self.terms else None
 
-    def cut(self, terms: int) -> FoundLaw:
+    def cut(self, terms: int) -> LawResult:
         """The law of the first ``terms`` terms."""
         return replace(self, terms=self.terms[:terms], afterwards=self.afterwards[:terms])
 
     @property
-    def rivals(self) -> list[Refit]:
+    def alternatives(self) -> list[Refit]:
         """The first term and its ties; empty without a law."""
         return [*self.terms[:1], *self.ties]
 
@@ -196,13 +197,13 @@ def _pieces(array: Float[np.ndarray, "group value *rest"]) -> Float[np.ndarray, 
 
 
 def _sums(
-    found: Responses,
+    linear: Responses,
     columns: Float[np.ndarray, "group value feature"],
     null: Float[np.ndarray, "group value draw"] | None = None,
 ) -> _Sums:
     """Sums of the residual, followed by simulated residuals."""
-    j, x, y = _pieces(found.jacobian), _pieces(columns), _pieces(found.residual)[..., None]
-    count = found.noise * np.count_nonzero(y[..., 0], axis=1)
+    j, x, y = _pieces(linear.jacobian), _pieces(columns), _pieces(linear.residual)[..., None]
+    count = linear.noise * np.count_nonzero(y[..., 0], axis=1)
     if null is not None:
         y = np.concatenate([y, _pieces(null)], axis=-1)
     return _Sums(
@@ -213,11 +214,11 @@ def _sums(
         np.swapaxes(x, 1, 2) @ y,
         np.sum(y**2, axis=1),
         count,
-        np.zeros(j.shape[2]) if found.pull is None else found.pull,
+        np.zeros(j.shape[2]) if linear.pull is None else linear.pull,
     )
 
 
-def left_out_gains(
+def cross_validated_gains(
     sums: _Sums, precision: Float[np.ndarray, "d d"] | None = None
 ) -> tuple[Float[np.ndarray, "feature data"], np.ndarray, np.ndarray, np.ndarray]:
     """Gain [nat] of every feature in every data set, each alone beside the base parameters; of the first data set also
@@ -231,22 +232,22 @@ def left_out_gains(
     and it pulls parameters towards its centre.
     """
     before, gain = 0.0, np.zeros(sums.xy.shape[1:])
-    held = np.eye(sums.jj.shape[1]) if precision is None else precision
+    prior = np.eye(sums.jj.shape[1]) if precision is None else precision
     whole = [part.sum(axis=0) for part in (sums.jj, sums.jx, sums.xx, sums.jy, sums.xy)]
     if precision is None:
         whole[3][:, 0] -= sums.pull
-    inverse = np.linalg.inv(whole[0] + held)
+    inverse = np.linalg.inv(whole[0] + prior)
     for p in range(len(sums.yy)):
         own = (sums.jj[p], sums.jx[p], sums.xx[p], sums.jy[p], sums.xy[p])
         others = [every - part for every, part in zip(whole, own, strict=True)]
-        b, u, c, _ = _solved(others, held)
+        b, u, c, _ = _solved(others, prior)
         left_j, left_jx = sums.jy[p] - sums.jj[p] @ b, sums.jx[p] - sums.jj[p] @ u
         along = sums.xy[p] - sums.jx[p].T @ b - u.T @ left_j - left_jx.T @ inverse @ left_j
         square = sums.xx[p] - np.sum(u * (sums.jx[p] + left_jx), axis=0) - np.sum(left_jx * (inverse @ left_jx), axis=0)
         gain += 2.0 * c * along - c**2 * square[:, None]
         first, own_j = left_j[:, 0], sums.jy[p, :, 0]
         before += sums.yy[p, 0] - float(b[:, 0] @ (own_j + first)) - float(first @ inverse @ first) - sums.count[p]
-    _, _, size, sd = _solved(whole, held)
+    _, _, size, sd = _solved(whole, prior)
     return 0.5 * gain, gain[:, 0] / max(before, 1e-300), size[:, 0], sd
 
 
@@ -255,9 +256,9 @@ def _solved(sums: Sequence[np.ndarray], precision: np.ndarray) -> tuple[np.ndarr
     jj, jx, xx, jy, xy = sums
     prior = jj + precision
     b, u = np.linalg.solve(prior, jy), np.linalg.solve(prior, jx)
-    left = xx - np.sum(u * jx, axis=0)
-    seen = left > COLLINEAR * np.maximum(xx, 1e-300)
-    safe = np.where(seen, left, 1.0)
+    remaining = xx - np.sum(u * jx, axis=0)
+    seen = remaining > COLLINEAR * np.maximum(xx, 1e-300)
+    safe = np.where(seen, remaining, 1.0)
     c = np.where(seen[:, None], (xy - u.T @ jy) / safe[:, None], 0.0)
     return b, u, c, np.where(seen, 1.0 / np.sqrt(safe), np.inf)
 
@@ -269,14 +270,14 @@ class LinearModel(NamedTuple):
         known: target of the simulator without a law.
         terms: terms of the model's law.
         fit: the model.
-        found: responses, with the residual and the slopes of the fit.
-        precision: precision of the base parameters, see `left_out_gains`.
+        responses: responses, with the residual and the slopes of the fit.
+        precision: precision of the base parameters, see `cross_validated_gains`.
     """
 
     known: FitTarget
     terms: Sequence[Refit]
     fit: Fit
-    found: Responses
+    responses: Responses
     precision: Float[np.ndarray, "d d"] | None = None
 
 
@@ -310,12 +311,12 @@ class LawSearch:
     scopes: tuple[Scope, ...] = (EVERYWHERE,)
     timed: bool = True
 
-    def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> FoundLaw:
+    def find(self, target: FitTarget, fit: Fit, forced: bool = False) -> LawResult:
         """Port and law of an effect that the model lacks: the last of `laws`."""
         *_, law = self.laws(target, fit, forced)
         return law
 
-    def laws(self, target: FitTarget, fit: Fit, forced: bool = False) -> Iterator[FoundLaw]:
+    def laws(self, target: FitTarget, fit: Fit, forced: bool = False) -> Iterator[LawResult]:
         """Ports of an effect that the model lacks, then its law after each term. The last law stands if the time is up.
 
         Args:
@@ -324,39 +325,39 @@ class LawSearch:
             forced: whether to search a first term although no port is significant.
         """
         known = target
-        found = responses(known, fit, self.ports, self.table, self.report)
-        values = self._values(found)
-        null = self._null(known, fit, found)
-        where = evidences(found, null)
-        centre = found.basis.centre - found.begun
-        law = FoundLaw(self.ports, where, [], [], [], centre, None, 0.0)
+        linear = responses(known, fit, self.ports, self.table, self.report)
+        values = self._values(linear)
+        null = self._null(known, fit, linear)
+        where = evidences(linear, null)
+        centre = linear.basis.centre - linear.begun
+        law = LawResult(self.ports, where, [], [], [], centre, None, 0.0)
         yield law
         try:
             while len(law.terms) != self.most and (where[0].adjusted_p <= self.family or (forced and not law.terms)):
                 terms = law.terms
                 if not terms:
-                    found = self._sharpened(known, fit, found, values, where)
-                    law = replace(law, offered=next((row.gain for row in self._ranked(found, values, 0.0)), 0.0))
-                gate = self._gate(found, values, null)
-                law = law if terms else replace(law, gate=gate)
-                ranked = self._ranked(found, values, gate, terms=terms)
-                model = LinearModel(known, terms, fit, found)
-                chosen = self._confirmed(model, ranked, gate, partial(leading_terms, where=where))
+                    linear = self._sharpened(known, fit, linear, values, where)
+                    law = replace(law, offered=next((row.gain for row in self._ranked(linear, values, 0.0)), 0.0))
+                null_quantile = self._null_quantile(linear, values, null)
+                law = law if terms else replace(law, null_quantile=null_quantile)
+                ranked = self._ranked(linear, values, null_quantile, terms=terms)
+                model = LinearModel(known, terms, fit, linear)
+                chosen = self._confirmed(model, ranked, null_quantile, partial(leading_terms, where=where))
                 refits = self._refits(known, terms, fit, chosen)
                 if not refits or refits[0].score <= 0.0:
                     break
-                best, others = self._exchanged(known, terms, found, values, refits, gate, where)
+                best, others = self._exchanged(known, terms, linear, values, refits, null_quantile, where)
                 if best.score <= 0.0:
                     break
                 ties = law.ties if terms else _tied(best, others)
                 best = self._shaped(known, terms, best)
-                judge, fit = judged_anew(best.target, best.fit)
-                anew = judge is not best.target
-                best = replace(best, target=judge, fit=fit)
-                found, known = under(found, known, judge), judge.on(target.forward)
-                found = _relinearised(known, found, fit)
-                null = self._null(known, fit, found)
-                where = evidences(found, null)
+                fit_target, fit = noise_updated(best.target, best.fit)
+                anew = fit_target is not best.target
+                best = replace(best, target=fit_target, fit=fit)
+                linear, known = under(linear, known, fit_target), fit_target.on(target.forward)
+                linear = _relinearised(known, linear, fit)
+                null = self._null(known, fit, linear)
+                where = evidences(linear, null)
                 self._say(best, where[0])
                 if anew and not terms:
                     ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
@@ -368,18 +369,18 @@ class LawSearch:
             yield law
 
     def _sharpened(
-        self, known: FitTarget, fit: Fit, found: Responses, values: np.ndarray, where: Sequence[PortEvidence]
+        self, known: FitTarget, fit: Fit, linear: Responses, values: np.ndarray, where: Sequence[PortEvidence]
     ) -> Responses:
         """Responses with exact columns at the ports that lead by evidence or gain, and at all that need no rollouts."""
-        by_gain = dict.fromkeys(row.port for row in self._ranked(found, values, 0.0))
+        by_gain = dict.fromkeys(row.port for row in self._ranked(linear, values, 0.0))
         leading = [row.port for row in where[:BY_EVIDENCE]] + list(by_gain)[:BY_GAIN]
         chosen = [p for p in self.ports.ports if p.stage == "sensing" or p in leading]
-        return with_exact_columns(known, fit, found, {port: self._offered(port, values)[1] for port in chosen})
+        return with_exact_columns(known, fit, linear, {port: self._offered(port, values)[1] for port in chosen})
 
-    def _values(self, found: Responses) -> Float[np.ndarray, "group feature row"]:
+    def _values(self, linear: Responses) -> Float[np.ndarray, "group feature row"]:
         """All features of the commands, then of the motion."""
-        values = self.table.over(found.levels)
-        return values if found.of_motion is None else np.concatenate([values, found.of_motion], axis=1)
+        values = self.table.over(linear.levels)
+        return values if linear.of_motion is None else np.concatenate([values, linear.of_motion], axis=1)
 
     def _has(self, port: Port, feature: Feature, group: str) -> bool:
         """Whether a law of the model has this term."""
@@ -406,28 +407,28 @@ class LawSearch:
         law = f"{best.term.port.words}: {best.feature.formula(names)}{in_words(best.term.scope)}"
         self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
-    def _null(self, known: FitTarget, fit: Fit, found: Responses) -> Float[np.ndarray, "draw n"]:
+    def _null(self, known: FitTarget, fit: Fit, linear: Responses) -> Float[np.ndarray, "draw n"]:
         """Whitened residuals of simulated data sets that lack nothing."""
         rng = np.random.default_rng([self.seed, 6])
-        draws = null_residuals(known.measurements, known.noise, found.base, len(fit.free), rng, NULLS)
-        return draws[:, : found.residual.size]
+        draws = null_residuals(known.measurements, known.noise, linear.base, len(fit.free), rng, NULLS)
+        return draws[:, : linear.residual.size]
 
-    def _gate(self, found: Responses, values: np.ndarray, null: Float[np.ndarray, "draw n"]) -> float:
+    def _null_quantile(self, linear: Responses, values: np.ndarray, null: Float[np.ndarray, "draw n"]) -> float:
         """Gain [nat] that the best of all features at all ports has in a share `family` of data sets that lack
         nothing."""
-        series = np.moveaxis(null.reshape(-1, *found.residual.shape), 0, 2)
+        series = np.moveaxis(null.reshape(-1, *linear.residual.shape), 0, 2)
         most = np.full(len(null), -np.inf)
         for port in self.ports.ports:
-            for _, columns in self._scoped(found, feature_columns(found, port, self._offered(port, values)[1])):
-                most = np.maximum(most, left_out_gains(_sums(found, columns, series))[0][:, 1:].max(axis=0))
+            for _, columns in self._scoped(linear, feature_columns(linear, port, self._offered(port, values)[1])):
+                most = np.maximum(most, cross_validated_gains(_sums(linear, columns, series))[0][:, 1:].max(axis=0))
         return float(np.quantile(most, 1.0 - self.family, method="higher"))
 
     def _ranked(
-        self, found: Responses, values: np.ndarray, gate: float, precision: Float[np.ndarray, "d d"] | None = None,
-        terms: Sequence[Refit] = (),
+        self, linear: Responses, values: np.ndarray, null_quantile: float,
+        precision: Float[np.ndarray, "d d"] | None = None, terms: Sequence[Refit] = (),
     ) -> list[TermGain]:  # fmt: skip
-        """All features at all ports whose gain exceeds the null quantile ``gate``, the largest gain first; see
-        `left_out_gains`.
+        """All features at all ports whose gain exceeds the null quantile ``null_quantile``, the largest gain first; see
+        `cross_validated_gains`.
 
         Terms already in the law or the model are excluded: at a strongly nonlinear port they would gain again. A term
         whose shape is inferred has every shape.
@@ -437,9 +438,9 @@ class LawSearch:
         had |= {_of_any_shape(refit.term.place) for refit in terms if refit.term.shape}
         for port in self.ports.ports:
             features, (sizes, signals) = self._features(port), self._offered(port, values)
-            for scope, columns in self._scoped(found, feature_columns(found, port, signals)):
-                gains, share, size, sd = left_out_gains(_sums(found, columns), precision)
-                for k in np.flatnonzero((gains[:, 0] > gate) & (share >= LEAST)).tolist():
+            for scope, columns in self._scoped(linear, feature_columns(linear, port, signals)):
+                gains, share, size, sd = cross_validated_gains(_sums(linear, columns), precision)
+                for k in np.flatnonzero((gains[:, 0] > null_quantile) & (share >= LEAST)).tolist():
                     parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                     row = TermGain(port, features[k], float(gains[k, 0]), float(share[k]), *parts, scope)
                     if not had & {row.place, _of_any_shape(row.place)} and not self._has(*row.place):
@@ -447,15 +448,15 @@ class LawSearch:
         return sorted(rows, key=lambda row: -row.gain)
 
     def _scoped(
-        self, found: Responses, columns: Float[np.ndarray, "group value feature"]
+        self, linear: Responses, columns: Float[np.ndarray, "group value feature"]
     ) -> Iterator[tuple[Scope, Float[np.ndarray, "group value feature"]]]:
         """Effects of features that act in the recordings of one scope only."""
         for scope in self.scopes:
-            yield scope, columns * scope.has(found.recordings)[:, None, None] if scope.group else columns
+            yield scope, columns * scope.has(linear.recordings)[:, None, None] if scope.group else columns
 
     def _exchanged(
-        self, known: FitTarget, terms: Sequence[Refit], found: Responses, values: np.ndarray, refits: Sequence[Refit],
-        gate: float, where: Sequence[PortEvidence],
+        self, known: FitTarget, terms: Sequence[Refit], linear: Responses, values: np.ndarray, refits: Sequence[Refit],
+        null_quantile: float, where: Sequence[PortEvidence],
     ) -> tuple[Refit, list[Refit]]:  # fmt: skip
         """The best term after full optimisation, or a replacement; and all other refits.
 
@@ -466,7 +467,7 @@ class LawSearch:
         nonlinear.
         """
         chosen, every = refits[0], list(refits)
-        best, tried = self._climbed(chosen), {chosen.term.place}
+        best, tried = self._optimised(chosen), {chosen.term.place}
         for _ in range(EXCHANGES):
             fit = best.fit
             without = fit.x.copy()
@@ -474,10 +475,10 @@ class LawSearch:
             residual = best.target.residual(without[None])[0]
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
-            model = LinearModel(known, terms, bare, _relinearised(known, found, bare), _precision(known, bare))
-            ranked = self._ranked(model.found, values, gate, model.precision, terms)
+            model = LinearModel(known, terms, bare, _relinearised(known, linear, bare), _precision(known, bare))
+            ranked = self._ranked(model.responses, values, null_quantile, model.precision, terms)
             ranked = [row for row in ranked if row.place not in tried]
-            fresh = self._confirmed(model, ranked, gate, partial(fresh_terms, best=best.term, where=where))
+            fresh = self._confirmed(model, ranked, null_quantile, partial(fresh_terms, best=best.term, where=where))
             tried |= {row.place for row in fresh}
             others = [self._refit(known, terms, bare, row) for row in fresh]
             every += others
@@ -486,7 +487,7 @@ class LawSearch:
                 break
             words = f"{better.term.port.words}: {better.term.feature.formula(self.units[0])}"
             self.report(f"instead: {words}{in_words(better.term.scope)}")
-            best = self._climbed(better)
+            best = self._optimised(better)
         before = chosen.square + 2.0 * (chosen.score + self._cost(known))
         best, *every = (replace(r, score=0.5 * (before - r.square) - self._cost(known)) for r in (best, *every))
         return best, every
@@ -498,7 +499,7 @@ class LawSearch:
         return float(0.5 * np.log(count) + np.log(choices))
 
     def _confirmed(
-        self, model: LinearModel, ranked: Sequence[TermGain], gate: float,
+        self, model: LinearModel, ranked: Sequence[TermGain], null_quantile: float,
         chosen: Callable[[Sequence[TermGain]], list[TermGain]],
     ) -> list[TermGain]:  # fmt: skip
         """The terms to refit, each with its gain beside the present model.
@@ -511,7 +512,7 @@ class LawSearch:
         while fresh := [row for row in chosen(rows) if row.place not in seen]:
             seen |= {row.place: row for row in self._beside(model, fresh)}
             rows = [seen.get(row.place, row) for row in rows]
-            rows = sorted((r for r in rows if r.gain > gate and r.share >= LEAST), key=lambda row: -row.gain)
+            rows = sorted((r for r in rows if r.gain > null_quantile and r.share >= LEAST), key=lambda row: -row.gain)
         return chosen(rows)
 
     def _beside(self, model: LinearModel, rows: Sequence[TermGain]) -> list[TermGain]:
@@ -525,8 +526,8 @@ class LawSearch:
             return {"slopes": target.slopes(np.repeat(x[None], len(rows), axis=0), directions)[0]}
 
         series = target.measurements.series(target.recall("terms", [x], compute)["slopes"])
-        columns = np.moveaxis(series.reshape(len(rows), len(model.found.residual), -1), 0, 2)
-        gains, share, size, sd = left_out_gains(_sums(model.found, columns), model.precision)
+        columns = np.moveaxis(series.reshape(len(rows), len(model.responses.residual), -1), 0, 2)
+        gains, share, size, sd = cross_validated_gains(_sums(model.responses, columns), model.precision)
         scales = [float(term.spec.prior["scale"]) for term in placed_terms]
         numbers = zip(rows, gains[:, 0].tolist(), share.tolist(), size * scales, sd * scales, strict=True)
         return [replace(row, gain=g, share=s, size=float(c), sd=float(d)) for row, g, s, c, d in numbers]
@@ -542,10 +543,10 @@ class LawSearch:
         """Terms, each refitted; the best first."""
         refits = []
         for row in chosen:
-            found = self._refit(known, terms, fit, row)
-            refits.append(found)
+            tried = self._refit(known, terms, fit, row)
+            refits.append(tried)
             words = f"{row.port.words}: {row.feature.formula(self.units[0])}{in_words(row.scope)}"
-            self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {found.score:.1f}")
+            self.report(f"refit with {words}: left-out gain {row.gain:.1f}, score {tried.score:.1f}")
         return sorted(refits, key=lambda refit: -refit.score)
 
     def _refit(self, known: FitTarget, terms: Sequence[Refit], fit: Fit, row: TermGain) -> Refit:
@@ -555,13 +556,13 @@ class LawSearch:
         start = np.append(fit.x, np.clip(row.size / scale, -FARTHEST, FARTHEST))
         free = np.append(fit.free, len(start) - 1)
         target = known.on(self._with(known, terms, [term]))
-        found = climb(target, start, free, evaluations=GLANCE)
-        gained = float(fit.residual @ fit.residual - found.residual @ found.residual)
-        return Refit(term, target, found, row, 0.5 * gained - self._cost(known))
+        fitted = optimise(target, start, free, evaluations=GLANCE)
+        gained = float(fit.residual @ fit.residual - fitted.residual @ fitted.residual)
+        return Refit(term, target, fitted, row, 0.5 * gained - self._cost(known))
 
-    def _climbed(self, refit: Refit) -> Refit:
+    def _optimised(self, refit: Refit) -> Refit:
         """The refit after a complete optimisation."""
-        return replace(refit, fit=climb(refit.target, refit.fit.x, refit.fit.free))
+        return replace(refit, fit=optimise(refit.target, refit.fit.x, refit.fit.free))
 
     def _shaped(self, known: FitTarget, terms: Sequence[Refit], best: Refit) -> Refit:
         """The same with the shape of the last term's feature inferred, if the data prefer another shape.
@@ -572,14 +573,14 @@ class LawSearch:
             return best
         term = best.term.with_shape(self.units[1])
         target, start = known.on(self._with(known, terms, [term])), np.append(best.fit.x, 0.0)
-        fit = climb(target, start, np.append(best.fit.free, len(best.fit.x)))
-        found = replace(best, term=term, target=target, fit=fit)
+        fit = optimise(target, start, np.append(best.fit.free, len(best.fit.x)))
+        shaped = replace(best, term=term, target=target, fit=fit)
         cost = 0.5 * float(np.log(max(float(np.sum(known.measurements.valid)), 2.0)))
-        gained = 0.5 * (best.square - found.square) - cost
+        gained = 0.5 * (best.square - shaped.square) - cost
         if gained <= 0.0:
             return best
-        self.report(f"its shape is {found.feature.shape:.3g}, {gained:.1f} nats better than {best.feature.shape:.3g}")
-        return replace(found, score=best.score + gained)
+        self.report(f"its shape is {shaped.feature.shape:.3g}, {gained:.1f} nats better than {best.feature.shape:.3g}")
+        return replace(shaped, score=best.score + gained)
 
 
 def leading_terms(ranked: Sequence[TermGain], where: Sequence[PortEvidence]) -> list[TermGain]:
@@ -618,11 +619,11 @@ FARTHEST = 100.0  # prior deviations within which a refit starts
 
 def _tied(best: Refit, others: Sequence[Refit]) -> list[Refit]:
     """Refits of other terms with residuals as small as the best, within `TIED`; each term once, the best first."""
-    found: dict[tuple[Port, Feature, str], Refit] = {}
+    refits_by_place: dict[tuple[Port, Feature, str], Refit] = {}
     for refit in sorted(others, key=lambda refit: -refit.score):
-        found.setdefault(refit.term.place, refit)
-    found.pop(best.term.place, None)
-    return [refit for refit in found.values() if refit.score > best.score - TIED]
+        refits_by_place.setdefault(refit.term.place, refit)
+    refits_by_place.pop(best.term.place, None)
+    return [refit for refit in refits_by_place.values() if refit.score > best.score - TIED]
 
 
 def _under_noise_of(best: Refit, tie: Refit) -> Refit:
@@ -630,9 +631,9 @@ def _under_noise_of(best: Refit, tie: Refit) -> Refit:
     discriminates less.
     """
     target = best.target.on(tie.target.forward)
-    fit = climb(target, tie.fit.x, tie.fit.free, evaluations=GLANCE)
-    found = replace(tie, target=target, fit=fit)
-    return replace(found, score=best.score - 0.5 * (found.square - best.square))
+    fit = optimise(target, tie.fit.x, tie.fit.free, evaluations=GLANCE)
+    refit = replace(tie, target=target, fit=fit)
+    return replace(refit, score=best.score - 0.5 * (refit.square - best.square))
 
 
 def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:
@@ -647,16 +648,16 @@ def _precision(known: FitTarget, fit: Fit) -> Float[np.ndarray, "free free"]:
     return np.linalg.inv(fit.covariance / np.outer(scale, scale))
 
 
-def _relinearised(known: FitTarget, found: Responses, fit: Fit) -> Responses:
+def _relinearised(known: FitTarget, linear: Responses, fit: Fit) -> Responses:
     """The same responses beside the residual and the slopes of another fit, the coefficients of laws among them."""
-    groups = found.residual.shape[0]
+    groups = linear.residual.shape[0]
     white = known.measurements.series(fit.residual).reshape(groups, -1)
     slopes = known.measurements.series(fit.jacobian.T).reshape(len(fit.free), groups, -1)
     scale = _scale(known, fit)
     own = known.forward.coordinates
     pulls = np.append(own.prior_slopes(fit.x[: len(own.names)])[0], -fit.x[len(own.names) :])  # laws have unit normals
     jacobian = np.moveaxis(slopes * scale[:, None, None], 0, 2)
-    return replace(found, residual=white, jacobian=jacobian, pull=-pulls[fit.free] * scale)
+    return replace(linear, residual=white, jacobian=jacobian, pull=-pulls[fit.free] * scale)
 
 
 def law_search(

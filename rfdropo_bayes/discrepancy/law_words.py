@@ -37,14 +37,14 @@ def law_record(answer: Answer) -> dict[str, Any] | None:
         return None
     gain, names = described.gain, channels_of(answer)
     return {
-        "port": described.found.terms[0].term.port.name,
-        "formula": formula(described.found.terms, names),
+        "port": described.search.terms[0].term.port.name,
+        "formula": formula(described.search.terms, names),
         "terms": coefficients(described, answer.problem.seed),
         "holds": described.holds,
         "beside": list(described.beside),
         "stands_in": list(described.stand_ins),
-        "ties": [_tie(tie, names) for tie in described.found.ties],
-        "log_evidence_left": None if described.found.after is None else described.found.after.log_evidence,
+        "ties": [_tie(tie, names) for tie in described.search.ties],
+        "log_evidence_left": None if described.search.after is None else described.search.after.log_evidence,
         "rmse_before_mm": None if gain is None else MILLIMETRES * gain.rmse_base,
         "rmse_after_mm": None if gain is None else MILLIMETRES * gain.rmse_extended,
         "explained_fraction": None if gain is None else gain.explained,
@@ -60,10 +60,10 @@ def ports_record(answer: Answer) -> dict[str, Any] | None:
     if described is None:
         return None
     return {
-        "ports": [_port(row) for row in described.found.ports],
-        "left_out": dict(described.found.map.left_out),
-        "time_s": described.found.centre.tolist(),
-        "gate_nats": described.found.gate,
+        "ports": [_port(row) for row in described.search.ports],
+        "left_out": dict(described.search.map.left_out),
+        "time_s": described.search.centre.tolist(),
+        "null_quantile_nats": described.search.null_quantile,
     }
 
 
@@ -101,21 +101,23 @@ def law_sentence(answer: Answer) -> str:
     assert described.gain is not None
     gain, names = described.gain, channels_of(answer)
     rows = coefficients(described, answer.problem.seed)
-    laws = " and ".join(_one(refit, row, names) for refit, row in zip(described.found.terms, rows, strict=True))
+    laws = " and ".join(_one(refit, row, names) for refit, row in zip(described.search.terms, rows, strict=True))
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
     unknown = "no mechanism of the library describes" if answer.problem.candidates else "the model lacks"
     head = f"An effect acts that {unknown}: {laws}{_when(described, answer.problem.timed)}"
     worth = f"it explains {gain.share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
-    looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.found.terms))
+    looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.search.terms))
     return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."
 
 
 def _one(refit: Refit, row: dict[str, Any], names: Sequence[str]) -> str:
     feature, unit = refit.feature, "" if row["unit"] == "-" else f" {row['unit']}"
     size = f"{row['mean']:.3g} \u00b1 {row['sd']:.2g}{unit}"
-    found = f"{size} times {feature.formula(names)}{_shape(row)}"
-    return f"at {refit.term.port.words}{in_words(refit.term.scope)} it changes {feature.words(names)} ({found})"
+    size_and_formula = f"{size} times {feature.formula(names)}{_shape(row)}"
+    return (
+        f"at {refit.term.port.words}{in_words(refit.term.scope)} it changes {feature.words(names)} ({size_and_formula})"
+    )
 
 
 def _shape(row: dict[str, Any]) -> str:
@@ -128,10 +130,10 @@ def _shape(row: dict[str, Any]) -> str:
 
 def _when(described: Described, timed: bool) -> str:
     """When the signals at the members of the law's port are largest."""
-    term = described.found.terms[0].term
-    members = described.found.map.members(term.port)
-    size = np.sqrt(np.mean([row.mean**2 for row in described.found.ports if row.port in members], axis=(0, 1)))
-    large = described.found.centre[size > 0.7 * size.max()]
+    term = described.search.terms[0].term
+    members = described.search.map.members(term.port)
+    size = np.sqrt(np.mean([row.mean**2 for row in described.search.ports if row.port in members], axis=(0, 1)))
+    large = described.search.centre[size > 0.7 * size.max()]
     return f", most {span_in_words(large.min(), large.max(), timed)}"
 
 
@@ -152,13 +154,13 @@ def _beside(described: Described) -> str:
 
 
 def _ties(described: Described, names: Sequence[str]) -> str:
-    ties = described.found.ties[:MOST_TIES]
+    ties = described.search.ties[:MOST_TIES]
     if not ties:
         return ""
-    found = ", ".join(
+    listed = ", ".join(
         f"{tie.feature.formula(names)} at {tie.term.port.words}{in_words(tie.term.scope)}" for tie in ties
     )
-    return f" Indistinguishable from it in these data: {found}."
+    return f" Indistinguishable from it in these data: {listed}."
 
 
 def ports_sentence(answer: Answer) -> str:
@@ -166,11 +168,13 @@ def ports_sentence(answer: Answer) -> str:
     described = answer.causes.described
     if described is None or described.holds:
         return ""
-    rows = described.found.significant(answer.problem.rules.family)
+    rows = described.search.significant(answer.problem.rules.family)
     if not rows:
         return ""
-    left = answer.extended.residual
-    if left @ left > POOR * np.count_nonzero(left):  # the noise is as large as the residuals, and shrinks the signal
+    residual = answer.extended.residual
+    if residual @ residual > POOR * np.count_nonzero(
+        residual
+    ):  # the noise is as large as the residuals, and shrinks the signal
         return f" Of all ports, a signal at {rows[0].port.words} explains most of it; {_no_law(answer)}."
     size = f"{rows[0].amplitude:.2g}" + ("" if rows[0].port.unit == "-" else f" {rows[0].port.unit}")
     others = ", ".join(row.port.words for row in rows[1 : 1 + MOST_TIES])
@@ -185,7 +189,7 @@ def _no_law(answer: Answer) -> str:
     if described.last is None or described.gain is None:
         return "no law of it holds"
     rows = coefficients(described, answer.problem.seed)
-    terms = zip(described.found.terms, rows, strict=True)
+    terms = zip(described.search.terms, rows, strict=True)
     laws = " and ".join(_one(refit, row, channels_of(answer)) for refit, row in terms)
     gain = described.gain
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
@@ -203,7 +207,7 @@ def law_tables(answer: Answer) -> list[dict[str, Any]]:
     names, fit = channels_of(answer), described.sizes[0]
     coordinates = described.sizes[1].forward.coordinates
     tables: dict[str, list[dict[str, Any]]] = {}
-    for refit in described.found.terms:
+    for refit in described.search.terms:
         feature, spec = refit.feature, refit.term.spec
         size = abs(float(fit.x[coordinates.names.index(spec.name)]))
         entry: dict[str, Any] = {"coefficient": spec.name, "feature": feature.kind}

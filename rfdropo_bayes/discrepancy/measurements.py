@@ -40,7 +40,7 @@ class Measurements:
     weighed: WeighedParts | None  # weighed parts; None without
     count: Float[np.ndarray, "group time column"]  # number of valid repeats of each value
     # every recording less the mean of its group, in the unit of the noise
-    spread: Float[np.ndarray, "recording time column"]
+    departures: Float[np.ndarray, "recording time column"]
     # recordings that repeat commands of another recording but are not joined with it, as their rows or clocks differ
     apart: tuple[str, ...] = ()
 
@@ -57,10 +57,10 @@ class Measurements:
     @property
     def single_steps(self) -> Float[np.ndarray, " recording"]:
         """Time between rows of each recording [s]."""
-        found = np.empty(len(self.single_valid))
+        steps = np.empty(len(self.single_valid))
         for group, step in zip(self.members, self.steps, strict=True):
-            found[list(group)] = step
-        return found
+            steps[list(group)] = step
+        return steps
 
     @property
     def single_valid(self) -> Bool[np.ndarray, "recording time column"]:
@@ -113,7 +113,7 @@ class Measurements:
         """See `repeat_shift`, of the markers; None without repeats."""
         if not self.has_repeats:
             return None
-        deviations, valid, share = self.deviations(self.spread)
+        deviations, valid, share = self.deviations(self.departures)
         steps = self.single_steps[repeated(self.members)]
         return repeat_shift(deviations[..., : self.markers], valid[..., : self.markers], share, steps)
 
@@ -128,17 +128,17 @@ class Measurements:
             parameters: number of fitted parameters of that model.
             like: an earlier estimate, whose order, pooling and sharing are kept.
         """
-        left, valid, steps = errors, self.single_valid, self.single_steps
+        departures, valid, steps = errors, self.single_valid, self.single_steps
         share, source = max(1.0 - parameters / max(valid.sum(), 1), 0.1), RESIDUALS
         if self.has_repeats:
-            (left, valid, share), source = self.deviations(errors), REPEATS
+            (departures, valid, share), source = self.deviations(errors), REPEATS
             steps = steps[repeated(self.members)]
-        found = []
+        estimates = []
         for index, own in enumerate(self.columns):
             model = None if like is None else like.parts[index]
             options = {"source": source, "steps": steps, **_like(model, source)}
-            found.append(estimate_noise(left[..., own], valid[..., own], share, **options))
-        return Stacked(tuple(found))
+            estimates.append(estimate_noise(departures[..., own], valid[..., own], share, **options))
+        return Stacked(tuple(estimates))
 
     @property
     def columns(self) -> list[slice]:
@@ -195,9 +195,9 @@ def gather_measurements(
 
 def _of_one_kind(groups: Groups, kinds: Sequence[Hashable]) -> Groups:
     """Groups of repeats, split if their recordings have different parameters."""
-    found: dict[tuple[int, Hashable], tuple[int, ...]] = {}
+    groups_by_kind: dict[tuple[int, Hashable], tuple[int, ...]] = {}
     for number, group in enumerate(groups):
         for index in group:
             key = (number, kinds[index])
-            found[key] = (*found.get(key, ()), index)
-    return tuple(found.values())
+            groups_by_kind[key] = (*groups_by_kind.get(key, ()), index)
+    return tuple(groups_by_kind.values())

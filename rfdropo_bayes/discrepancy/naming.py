@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
-from rfdropo_bayes.discrepancy.repairs import climbed_again, paying_pair, without_needless
-from rfdropo_bayes.discrepancy.screen import Screen, p_in_words
+from rfdropo_bayes.discrepancy.repairs import optimised_again, paying_pair, without_needless
+from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
 
 
 @dataclass(frozen=True)
@@ -24,20 +24,20 @@ class Named:
         search: search beside the base model.
         base: its fit.
         steps: mechanisms added to it.
-        screen: score tests of the model with all steps; None if not tested yet.
+        tests: score tests of the model with all steps; None if not tested yet.
         tried: candidates refitted beside that model; None before the first.
     """
 
     search: ExtensionSearch
     base: Fit
     steps: tuple[Added, ...] = ()
-    screen: Screen | None = None
+    tests: ScoreTests | None = None
     tried: Refits | None = None
 
     @property
-    def judge(self) -> FitTarget:
+    def fit_target(self) -> FitTarget:
         """The target with the noise of the last model."""
-        return self.steps[-1].judge if self.steps else self.search.target
+        return self.steps[-1].fit_target if self.steps else self.search.target
 
     @property
     def fit(self) -> Fit:
@@ -52,12 +52,12 @@ class Named:
     @property
     def asked(self) -> ExtensionSearch:
         """Search beside the last model."""
-        return self.search.under(self.judge)
+        return self.search.under(self.fit_target)
 
     @property
-    def screens(self) -> list[Screen]:
+    def test_series(self) -> list[ScoreTests]:
         """Score tests of the base model and after each step; for the last model only if tested."""
-        return [*(step.before for step in self.steps), *([] if self.screen is None else [self.screen])]
+        return [*(step.before for step in self.steps), *([] if self.tests is None else [self.tests])]
 
     @property
     def gains(self) -> dict[str, float]:
@@ -72,13 +72,13 @@ class Named:
     @property
     def best(self) -> Added | None:
         """The best of the candidates that were refitted; None if none is worth it."""
-        if self.screen is None or self.tried is None:
+        if self.tests is None or self.tried is None:
             return None
-        return self.asked.best(self.screen, self.tried, bool(self.steps))
+        return self.asked.best(self.tests, self.tried, bool(self.steps))
 
     def extended(self, steps: Sequence[Added]) -> Named:
         """The model with other steps, without score tests."""
-        return replace(self, steps=tuple(steps), screen=None, tried=None)
+        return replace(self, steps=tuple(steps), tests=None, tried=None)
 
     def with_best(self) -> Named:
         """The model with the best refitted candidate, if it has enough evidence."""
@@ -102,23 +102,23 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
     clock, report, rules = search.target.forward.deadline, search.report, search.rules
     named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
     while True:
-        named = _judged(named)
-        found = named.asked.screened(named.fit, named.names)
-        named = replace(named, screen=found)
+        named = _with_own_noise(named)
+        tests = named.asked.score_tests(named.fit, named.names)
+        named = replace(named, tests=tests)
         yield named
-        p = found.omnibus.p
+        p = tests.omnibus.p
         if not named.steps and p > rules.base_passes:
             return
-        first = found.rows[0].name if found.rows else "none"
+        first = tests.rows[0].name if tests.rows else "none"
         report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")
         if named.asked.room(len(named.steps)) < 1 or p > rules.extended_passes:
             return
         with clock.stage("refits"):
-            for tried in named.asked.refits(found):
+            for tried in named.asked.refits(tests):
                 named = replace(named, tried=tried)
                 yield named
             step = named.best
-            pair = paying_pair(named.asked, found, named.names, step)
+            pair = paying_pair(named.asked, tests, named.names, step)
             if pair:
                 named = named.extended([*named.steps, *pair])
                 yield named
@@ -126,7 +126,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
                 continue
             if step is None:
                 return
-            again = climbed_again(named.asked, step) if len(named.steps) not in renewed else None
+            again = optimised_again(named.asked, step) if len(named.steps) not in renewed else None
             if again is not None:
                 renewed.add(len(named.steps))
                 report(f"without {step.name}, a better optimum than before: the question once more")
@@ -137,12 +137,12 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
             named = without_needless_steps(named)
 
 
-def _judged(named: Named) -> Named:
+def _with_own_noise(named: Named) -> Named:
     """The last model with the noise of its present residuals."""
     if not named.steps:
         return named
-    judge, fit = fit_with_noise(named.judge.measured, named.fit.x, named.fit.free)
-    return named.extended([*named.steps[:-1], replace(named.steps[-1], fit=fit, judge=judge)])
+    fit_target, fit = fit_with_noise(named.fit_target.measured, named.fit.x, named.fit.free)
+    return named.extended([*named.steps[:-1], replace(named.steps[-1], fit=fit, fit_target=fit_target)])
 
 
 def without_needless_steps(named: Named) -> Named:

@@ -1,7 +1,7 @@
 """The audit from data to verdict: show, name, extend, measure.
 
-`findings` is a generator: each `Found` has all results so far, and `conclude` makes an answer of any of them. An audit
-stopped by its time limit or by Ctrl-C therefore answers with its present results.
+`findings` is a generator: each `Results` has all results so far, and `conclude` makes an answer of any of them. An
+audit stopped by its time limit or by Ctrl-C therefore answers with its present results.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from rfdropo_bayes.discrepancy.base_fit import (
 from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime
 from rfdropo_bayes.discrepancy.described import Described, describe
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch, numerical_shift
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise, widened
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, noise_distance
 from rfdropo_bayes.discrepancy.held_out import HeldOut, Kept, keep_supported
-from rfdropo_bayes.discrepancy.inadequacy import as_measured, leaves_noise, spread
+from rfdropo_bayes.discrepancy.inadequacy import as_measured, leaves_noise, residual_deviation
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.naming import Named, name_causes, without_each_other
 from rfdropo_bayes.discrepancy.prior_ends import decided_by_priors
 from rfdropo_bayes.discrepancy.remainder import Remainder, describe_remainder
-from rfdropo_bayes.discrepancy.screen import Screen, p_in_words
+from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
 from rfdropo_bayes.discrepancy.verdict import DESCRIBED, NEGLIGIBLE, NO_VERDICT, PARTLY, UNEXPLAINED, decide, negligible
 
 BASE, CAUSES = "the fit of the base model", "naming causes"
@@ -45,7 +45,7 @@ GAIN, LAWS = "the gain on unseen recordings", "laws at ports"
 
 
 @dataclass(frozen=True)
-class Found:
+class Results:
     """Intermediate results of an audit.
 
     Attributes:
@@ -66,20 +66,20 @@ class Found:
     described: Described | None = None
     ended: tuple[str, ...] = ()
 
-    def after(self, part: str) -> Found:
+    def after(self, part: str) -> Results:
         """The results with one more finished part."""
         return replace(self, ended=(*self.ended, part))
 
     @property
-    def left(self) -> tuple[str, ...]:
+    def unfinished(self) -> tuple[str, ...]:
         """Unfinished parts, in words."""
         waiting = () if self.named is None else self.named.waiting
         parts = [BASE, CAUSES, *([GAIN] if self.named is None or self.named.steps else [])]
-        found = [part for part in parts if part not in self.ended]
+        unfinished = [part for part in parts if part not in self.ended]
         if waiting:
-            found[found.index(CAUSES)] = f"refits with {', '.join(waiting)}, and further causes"
+            unfinished[unfinished.index(CAUSES)] = f"refits with {', '.join(waiting)}, and further causes"
         asks = self.problem.ports is not None and self.problem.compared is None
-        return (*found, *([LAWS] if asks and LAWS not in self.ended else []))
+        return (*unfinished, *([LAWS] if asks and LAWS not in self.ended else []))
 
 
 @dataclass(frozen=True)
@@ -89,14 +89,14 @@ class Causes:
     Attributes:
         steps: steps supported by unseen recordings; all steps if none is supported.
         unsupported: mechanisms supported by fitted but not by unseen recordings.
-        screens: score tests of the base model, and after each step.
+        test_series: score tests of the base model, and after each step.
         refits: log Bayes factors of candidates refitted beside the last model but not added.
         described: effect that the library lacks; None if no misfit was left.
     """
 
     steps: list[Added]
     unsupported: list[str]
-    screens: list[Screen]
+    test_series: list[ScoreTests]
     refits: dict[str, float] = field(default_factory=dict)
     described: Described | None = None
 
@@ -132,12 +132,14 @@ class Validation:
     @classmethod
     def of_law(cls, described: Described) -> Validation:
         """Validation on unseen recordings of the base model with a law, alone or beside mechanisms."""
-        held = described.held_out
-        if held is None:
+        held_out = described.held_out
+        if held_out is None:
             return cls()
         if described.steps:
-            return cls.of_steps(held, len(described.steps))
-        return cls(described.overall, [], held.which, (held.predictions[0], held.predictions[-1]), held.unseen)
+            return cls.of_steps(held_out, len(described.steps))
+        return cls(
+            described.overall, [], held_out.which, (held_out.predictions[0], held_out.predictions[-1]), held_out.unseen
+        )
 
 
 @dataclass(frozen=True)
@@ -164,14 +166,14 @@ class Cost:
 
     Attributes:
         stopped: why it ended before all was done, "time" or "interrupt"; empty if it finished.
-        left: unfinished parts.
+        unfinished: unfinished parts.
         rollouts: rollouts of the whole run.
         profile: seconds of each stage, summed over all parts of a resumed audit.
         waited: seconds of waiting of its last part for processors used by other programs.
     """
 
     stopped: str
-    left: tuple[str, ...]
+    unfinished: tuple[str, ...]
     rollouts: int
     profile: dict[str, float]
     waited: float
@@ -211,7 +213,7 @@ class Answer:
     @property
     def fitted(self) -> bool:
         """Whether the base fit finished; if not, its parameters are the search's last point."""
-        return BASE not in self.cost.left
+        return BASE not in self.cost.unfinished
 
     @property
     def converged(self) -> bool:
@@ -226,8 +228,8 @@ class Answer:
     @property
     def law(self) -> Described | None:
         """The adopted law; None without an adopted law."""
-        found = self.causes.described
-        return found if found is not None and found.holds else None
+        described = self.causes.described
+        return described if described is not None and described.holds else None
 
     @property
     def adopted(self) -> list[Added]:
@@ -256,127 +258,131 @@ def audit(
         InputError: rollouts at the optimum fail.
     """
     clock = deadline or Deadline(problem.rules.minutes)
-    found = Found(problem, beginning(problem, first_target(problem, journal or Journal(), clock)))
+    results = Results(problem, beginning(problem, first_target(problem, journal or Journal(), clock)))
     with clock.stopping(report):
-        for known in findings(found, report):
-            found = known
-    return conclude(found, report)
+        for known in findings(results, report):
+            results = known
+    return conclude(results, report)
 
 
-def findings(begun: Found, report: Callable[[str], None]) -> Iterator[Found]:
+def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]:
     """Results after each part of an audit.
 
     Raises:
         OutOfTime: the time is up.
     """
     clock = begun.reached.target.forward.deadline
-    found = begun
+    results = begun
     with clock.stage("base model"):
         for reached in base_fits(begun.problem, begun.reached, begun.problem.seed, report):
-            found = replace(found, reached=reached)
-            yield found
-    target, base = found.reached.settled()
+            results = replace(results, reached=reached)
+            yield results
+    target, base = results.reached.settled()
     problem = _with_differences_of(begun.problem, target)
-    found = replace(found, problem=problem).after(BASE)
-    report(f"base model fitted; {_noise(target.measured.noise.first)}{_far_off(target, base)}")
+    results = replace(results, problem=problem).after(BASE)
+    report(f"base model fitted; {_noise(target.measured.noise.first)}{_misspecified(target, base)}")
     firsts = [group[0] for group in target.measurements.members]
     finer = simulated(problem, True, target.measurements, firsts, clock) if problem.finer else None
     search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, finer, report)
     named = Named(search, base)
     for each in _named(named):
-        named, found = each, replace(found, named=each)
-        yield found
-    found = found.after(CAUSES)
+        named, results = each, replace(results, named=each)
+        yield results
+    results = results.after(CAUSES)
     kept = Kept(named, None)
     for each_kept in keep_supported(problem, replace(named, steps=without_each_other(named.steps))):
-        kept, found = each_kept, replace(found, kept=each_kept)
-        yield found
+        kept, results = each_kept, replace(results, kept=each_kept)
+        yield results
     last = kept.named
-    if last.steps and last.judge.noise.source == RESIDUALS:
-        kept = replace(kept, named=replace(last, screen=_final_screen(last)))
-    found = replace(found, kept=kept).after(GAIN)
-    yield found
+    if last.steps and last.fit_target.noise.source == RESIDUALS:
+        kept = replace(kept, named=replace(last, tests=_final_score_tests(last)))
+    results = replace(results, kept=kept).after(GAIN)
+    yield results
     verdict = _verdict(kept, problem, ended=True)
-    passes = kept.named.screens[-1].omnibus.p > problem.rules.extended_passes
+    passes = kept.named.test_series[-1].omnibus.p > problem.rules.extended_passes
     if verdict in (PARTLY, UNEXPLAINED) and not passes:
-        found = replace(found, suspected=_suspected(search, as_measured(last.search.target, last.base)))
-        yield found
+        results = replace(results, suspected=_suspected(search, as_measured(last.search.target, last.base)))
+        yield results
     # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that
     # passes the joint test leaves nothing to describe, even if the explained fraction is uncertain.
     if verdict == UNEXPLAINED or (verdict == PARTLY and not passes) or (verdict == NO_VERDICT and not base.converged):
         # Beside mechanisms that unseen recordings do not support, a law would have no support either.
         beside = last.extended(()) if verdict == UNEXPLAINED else last
         for described in describe(problem, beside, kept.held_out, report):
-            found = replace(found, described=described)
-            yield found
-    yield found.after(LAWS)
+            results = replace(results, described=described)
+            yield results
+    yield results.after(LAWS)
 
 
-def conclude(found: Found, report: Callable[[str], None] = lambda line: None) -> Answer:
+def conclude(results: Results, report: Callable[[str], None] = lambda line: None) -> Answer:
     """The answer from the present results. A stopped audit measures the gain of its present extension if the reserved
     time suffices; the other work takes only a few rollouts.
     """
-    problem, clock = found.problem, found.reached.target.forward.deadline
+    problem, clock = results.problem, results.reached.target.forward.deadline
     stopped = clock.reached
-    kept = found.kept or _kept_in_time(found, clock)
-    judge, fitted = kept.named.search.target, kept.named
-    base = as_measured(judge, fitted.base)
-    steps = [replace(step, fit=as_measured(step.judge, step.fit)) for step in fitted.steps]
-    screens, validation = fitted.screens, Validation.of_steps(kept.held_out, len(steps))
-    verdict, described = _verdict(kept, problem, ended=CAUSES in found.ended), found.described
+    kept = results.kept or _kept_in_time(results, clock)
+    fit_target, fitted = kept.named.search.target, kept.named
+    base = as_measured(fit_target, fitted.base)
+    steps = [replace(step, fit=as_measured(step.fit_target, step.fit)) for step in fitted.steps]
+    test_series, validation = fitted.test_series, Validation.of_steps(kept.held_out, len(steps))
+    verdict, described = _verdict(kept, problem, ended=CAUSES in results.ended), results.described
     if described is not None and described.holds:
         verdict = DESCRIBED
         if len(described.steps) < len(steps):
-            steps = [replace(step, fit=as_measured(step.judge, step.fit)) for step in described.steps]
-            screens = [*(step.before for step in steps), screens[-1]] if steps else screens[:1]
+            steps = [replace(step, fit=as_measured(step.fit_target, step.fit)) for step in described.steps]
+            test_series = [*(step.before for step in steps), test_series[-1]] if steps else test_series[:1]
             validation = Validation.of_law(described)
-    target, extended = judge.measured, steps[-1].fit if steps else base
+    target, extended = fit_target.measured, steps[-1].fit if steps else base
     sizes = extended
     with suppress(OutOfTime), clock.stage("sizes"):
-        sizes = widened(steps[-1].judge, extended) if steps else extended
+        sizes = widened(steps[-1].fit_target, extended) if steps else extended
     clock.lift()  # the rest are single rollouts for the report, and the optimisation for the sizes of a law
     finer, refined = fitted.search.finer, DISCRETISATION in [*fitted.names, *kept.unsupported]
     shown = None if refined or finer is None else numerical_shift(target, finer, extended)
-    left = extended.residual
+    residual = extended.residual
     if described is not None and described.holds and described.last is not None:
-        left = as_measured(described.last.target, described.last.fit).residual
-    remainder = describe_remainder(target.measurements, left, target.noise.first)
+        residual = as_measured(described.last.target, described.last.fit).residual
+    remainder = describe_remainder(target.measurements, residual, target.noise.first)
     if verdict in (PARTLY, UNEXPLAINED) and not steps:
         size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
         verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
     draws = sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds)
-    suspected = None if verdict == DESCRIBED else found.suspected
-    rollouts = judge.forward.rollouts + (finer.rollouts if finer else 0)
+    suspected = None if verdict == DESCRIBED else results.suspected
+    rollouts = fit_target.forward.rollouts + (finer.rollouts if finer else 0)
     return Answer(
         verdict,
         problem,
         target,
         base,
-        Causes(steps, list(kept.unsupported), screens, fitted.gains, described),
+        Causes(steps, list(kept.unsupported), test_series, fitted.gains, described),
         validation,
         remainder,
         sizes,
         draws,
         Doubts(suspected, target.measurements.shift, shown, decided_by_priors(target, draws)),
-        Cost(clock.why if stopped else "", found.left if stopped else (), rollouts, clock.profile, clock.waited),
+        Cost(
+            clock.why if stopped else "", results.unfinished if stopped else (), rollouts, clock.profile, clock.waited
+        ),
     )
 
 
-def _kept_in_time(found: Found, clock: Deadline) -> Kept:
+def _kept_in_time(results: Results, clock: Deadline) -> Kept:
     """Result of a stopped audit: the base model with the best named causes so far, its joint test, and the gain on
     unseen recordings if the reserved time suffices.
     """
-    named = found.named
+    named = results.named
     if named is None:
-        target, base = _settled(found.reached, clock)
-        named = Named(ExtensionSearch(target, found.problem.candidates, found.problem.rules, found.problem.seed), base)
+        target, base = _settled(results.reached, clock)
+        named = Named(
+            ExtensionSearch(target, results.problem.candidates, results.problem.rules, results.problem.seed), base
+        )
     named = named.with_best()
     named = replace(named, steps=without_each_other(named.steps))
-    if named.screen is None:
-        named = replace(named, screen=named.asked.tested(named.fit, len(named.steps)))
+    if named.tests is None:
+        named = replace(named, tests=named.asked.tested(named.fit, len(named.steps)))
     kept = Kept(named, None)
     with suppress(OutOfTime), clock.granted():
-        kept = next(iter(keep_supported(found.problem, named)))
+        kept = next(iter(keep_supported(results.problem, named)))
     return kept
 
 
@@ -389,10 +395,10 @@ def _settled(reached: Reached, clock: Deadline) -> tuple[FitTarget, Fit]:
 def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
     """The verdict on the named causes alone; ``ended`` is whether all candidates were tested."""
     named, rules = kept.named, problem.rules
-    noise, members = named.judge.measured.noise, [len(step.members) for step in named.steps]
+    noise, members = named.fit_target.measured.noise, [len(step.members) for step in named.steps]
     gain = Validation.of_steps(kept.held_out, len(named.steps)).gain
-    last = named.screens[-1].omnibus.p if named.steps else None
-    verdict = decide(rules, named.screens[0].omnibus.p, last, members, gain, noise.doubtful)
+    last = named.test_series[-1].omnibus.p if named.steps else None
+    verdict = decide(rules, named.test_series[0].omnibus.p, last, members, gain, noise.doubtful)
     if not named.fit.converged:  # clearly supported effects are found nevertheless
         return PARTLY if gain is not None and gain.clear else NO_VERDICT
     return verdict if ended or named.steps or verdict != UNEXPLAINED else NO_VERDICT
@@ -413,11 +419,11 @@ def _named(begun: Named) -> Iterator[Named]:
     if not first.steps or target.measured.noise.source not in (RESIDUALS, INNOVATIONS):
         return
     before = target.measured.noise
-    target = replace(target.measured, noise=residual_noise(first.judge, first.fit))
+    target = replace(target.measured, noise=residual_noise(first.fit_target, first.fit))
     if not leaves_noise(before, target.noise):
         return
     begun.search.report(f"once more with the noise that the extended model leaves, AR({target.noise.first.order})")
-    *_, again = name_causes(begun.search.under(target), climb(target, first.base.x, first.base.free))
+    *_, again = name_causes(begun.search.under(target), optimise(target, first.base.x, first.base.free))
     yield again
 
 
@@ -436,24 +442,24 @@ def _noise(noise: Autoregression) -> str:
     return f"noise from {noise.source}, AR({noise.order}){shared}"
 
 
-def _far_off(target: FitTarget, fit: Fit) -> str:
+def _misspecified(target: FitTarget, fit: Fit) -> str:
     """Phrase about a misspecified model for progress reports."""
     if target.known is None:
         return ""
     noise, own = target.noise.first.scale, target.measurements.columns[0]
-    left = spread(target, fit)[own]
-    size, share = 1e3 * np.sqrt(3.0 * np.mean(left**2)), float(np.mean((left / noise) ** 2))
+    deviation = residual_deviation(target, fit)[own]
+    size, share = 1e3 * np.sqrt(3.0 * np.mean(deviation**2)), float(np.mean((deviation / noise) ** 2))
     return f"; it is misspecified: white noise of {size:.2g} mm, the size of its residuals; a row counts {share:.2g}"
 
 
-def _final_screen(last: Named) -> Screen:
-    """The screen of the extended model under the noise that it leaves itself."""
-    renewed = replace(last.judge, noise=residual_noise(last.judge, last.fit))
-    fit = climb(renewed, last.fit.x, last.fit.free)
-    found = last.asked.under(renewed).screened(fit, last.names)
-    p = p_in_words(found.omnibus.p, last.search.rules.bootstraps)
+def _final_score_tests(last: Named) -> ScoreTests:
+    """The tests of the extended model under the noise that it leaves itself."""
+    renewed = replace(last.fit_target, noise=residual_noise(last.fit_target, last.fit))
+    fit = optimise(renewed, last.fit.x, last.fit.free)
+    tests = last.asked.under(renewed).score_tests(fit, last.names)
+    p = p_in_words(tests.omnibus.p, last.search.rules.bootstraps)
     last.search.report(f"joint test under the noise that it leaves: p {p}")
-    return found
+    return tests
 
 
 def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
@@ -462,6 +468,6 @@ def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
     if known.noise.source != STATED:
         return None
     target, fit = under_residual_noise(known, base)
-    found = search.under(target).screened(fit)
-    passes = found.omnibus.p > search.rules.base_passes and not target.noise.doubtful
+    tests = search.under(target).score_tests(fit)
+    passes = tests.omnibus.p > search.rules.base_passes and not target.noise.doubtful
     return target.noise if passes else None

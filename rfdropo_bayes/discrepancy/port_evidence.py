@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.discrepancy.port_responses import Responses
 from rfdropo_bayes.discrepancy.score import project_out
-from rfdropo_bayes.discrepancy.screen import tail
+from rfdropo_bayes.discrepancy.score_tests import tail
 from rfdropo_bayes.mechanisms.ports import Port
 
 MEMORIES = (0.1, 0.4, 1.5, 6.0)  # [s]
@@ -61,12 +61,12 @@ class Decomposed:
         """Log evidences of each size; ``projected`` is A'y in sizes of the port."""
         c = (self.root.T @ projected) ** 2
         square = SIZES[:, None] ** 2
-        spread = 1.0 + square * self.eigenvalues
-        return 0.5 * (square / spread) @ c - 0.5 * np.sum(np.log(spread), axis=1)[:, None]
+        variance = 1.0 + square * self.eigenvalues
+        return 0.5 * (square / variance) @ c - 0.5 * np.sum(np.log(variance), axis=1)[:, None]
 
 
 def evidences(
-    found: Responses, null: Float[np.ndarray, "draw n"], chosen: Sequence[Port] | None = None
+    linear: Responses, null: Float[np.ndarray, "draw n"], chosen: Sequence[Port] | None = None
 ) -> list[PortEvidence]:
     """Evidence of every port, the largest first.
 
@@ -75,24 +75,24 @@ def evidences(
         null: whitened residuals of simulated data sets without discrepancy.
         chosen: ports to test; all by default.
     """
-    base, ports = found.base, list(found.whitened) if chosen is None else list(chosen)
-    residual = project_out(base, found.residual.reshape(-1)[:, None])[:, 0]
+    base, ports = linear.base, list(linear.whitened) if chosen is None else list(chosen)
+    residual = project_out(base, linear.residual.reshape(-1)[:, None])[:, 0]
     data = np.concatenate([residual[:, None], null.T[: len(residual)]], axis=1)
-    kernels = [np.exp(-np.abs(np.subtract.outer(found.basis.centre, found.basis.centre)) / m) for m in MEMORIES]
+    kernels = [np.exp(-np.abs(np.subtract.outer(linear.basis.centre, linear.basis.centre)) / m) for m in MEMORIES]
     roots = [np.linalg.cholesky(kernel + 1e-10 * np.eye(len(kernel))) for kernel in kernels]
     best, every = {}, np.zeros((len(ports), data.shape[1]))
     for k, port in enumerate(ports):
-        parts = _decomposed(found, base, port, roots)
-        projected = _project(found, port, data)
+        parts = _decomposed(linear, base, port, roots)
+        projected = _project(linear, port, data)
         gains = np.stack([part.gains(projected) for part in parts])  # memory, size, data
         every[k] = np.maximum(gains.max(axis=(0, 1)), 0.0)
         place = np.unravel_index(int(np.argmax(gains[:, :, 0])), gains.shape[:2])
         best[port] = (parts[place[0]], float(SIZES[place[1]]), MEMORIES[place[0]], projected[:, 0])
-    most, excess = every[:, 1:].max(axis=0), float(residual @ residual) - found.noise * (len(residual) - base.shape[1])
+    most, excess = every[:, 1:].max(axis=0), float(residual @ residual) - linear.noise * (len(residual) - base.shape[1])
     rows = []
     for k, port in enumerate(ports):
         part, size, memory, projected = best[port]
-        mean, sd, share = _signal(part, size, projected, found.residual.shape[0], excess)
+        mean, sd, share = _signal(part, size, projected, linear.residual.shape[0], excess)
         rms = float(np.sqrt(np.mean(mean**2)))
         rows.append(
             PortEvidence(port, float(every[k, 0]), tail(every[k, 0], most), port.size * rms, memory, share,
@@ -101,19 +101,19 @@ def evidences(
     return sorted(rows, key=lambda row: -row.log_evidence)
 
 
-def _project(found: Responses, port: Port, data: Float[np.ndarray, "n data"]) -> Float[np.ndarray, "coefficient data"]:
+def _project(linear: Responses, port: Port, data: Float[np.ndarray, "n data"]) -> Float[np.ndarray, "coefficient data"]:
     """Phi'y of every data set, whose base parameters are projected out already, in sizes of the port."""
-    response = port.size * found.whitened[port]
-    series = data.reshape(*found.residual.shape, -1)
+    response = port.size * linear.whitened[port]
+    series = data.reshape(*linear.residual.shape, -1)
     return np.concatenate([part.T @ own for part, own in zip(response, series, strict=True)])
 
 
 def _decomposed(
-    found: Responses, base: Float[np.ndarray, "n rank"], port: Port, roots: Sequence[np.ndarray]
+    linear: Responses, base: Float[np.ndarray, "n rank"], port: Port, roots: Sequence[np.ndarray]
 ) -> list[Decomposed]:
-    response = port.size * found.whitened[port]
+    response = port.size * linear.whitened[port]
     groups, _, count = response.shape
-    across = base.reshape(*found.residual.shape, -1)
+    across = base.reshape(*linear.residual.shape, -1)
     taken = np.concatenate([part.T @ own for part, own in zip(response, across, strict=True)])
     gram = -taken @ taken.T
     for g, part in enumerate(response):
@@ -132,10 +132,10 @@ def _signal(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Mean and deviation of the signal in sizes of the port, and the share of the discrepancy that it explains."""
     lam, c = part.eigenvalues, part.root.T @ projected
-    spread = 1.0 + size**2 * lam
-    g = size**2 * c / spread
-    freedom = float(np.sum(size**2 * lam / spread))
+    variance = 1.0 + size**2 * lam
+    g = size**2 * c / variance
+    freedom = float(np.sum(size**2 * lam / variance))
     share = (2.0 * float(g @ c) - float(g @ (lam * g)) - freedom) / max(excess, 1e-300) if excess > 0.0 else 0.0
     mean = (part.root @ g).reshape(groups, -1)
-    sd = np.sqrt(np.sum(part.root**2 * (size**2 / spread), axis=1)).reshape(groups, -1)
+    sd = np.sqrt(np.sum(part.root**2 * (size**2 / variance), axis=1)).reshape(groups, -1)
     return mean, sd, share

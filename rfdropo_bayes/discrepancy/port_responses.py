@@ -123,11 +123,11 @@ def responses(
     simulated = [port for port in single if port.stage != "sensing"]
     rollouts = len(simulated) * basis.value.shape[1] * groups
     report(f"signals at {len(single)} ports: {rollouts} rollouts, {about(rollouts * forward.pace)}")
-    found = {}
+    whitened = {}
     shown = forward.observe_one(fit.x)
     signals = np.repeat(basis.value.T[:, None], groups, axis=1)
     for port in single:
-        found[port] = _response(target, fit, ports, port, signals[:, :, None], shown)
+        whitened[port] = _response(target, fit, ports, port, signals[:, :, None], shown)
     white = target.measurements.series(fit.residual).reshape(groups, -1)
     slopes = target.measurements.series(fit.jacobian.T) * forward.coordinates.prior_sd[fit.free][:, None, None, None]
     jacobian = np.moveaxis(slopes.reshape(len(fit.free), groups, -1), 0, 2)
@@ -136,7 +136,7 @@ def responses(
     moving = table.over_motion(theta, forward.commands, forward.deadline.check) if table.of_motion else None
     pull = -(forward.coordinates.prior_slopes(fit.x)[0] * forward.coordinates.prior_sd)[fit.free]
     noise = noise_share(target)
-    return Responses(ports, basis, found, white, jacobian, levels, begun, noise, forward.recordings, pull, moving)
+    return Responses(ports, basis, whitened, white, jacobian, levels, begun, noise, forward.recordings, pull, moving)
 
 
 def _response(
@@ -179,7 +179,7 @@ def _response(
 def with_exact_columns(
     target: FitTarget,
     fit: Fit,
-    found: Responses,
+    linear: Responses,
     features: Mapping[Port, Float[np.ndarray, "group feature member row"]],
 ) -> Responses:
     """The same with exact effects of features at their ports, instead of their nearest splines.
@@ -189,25 +189,25 @@ def with_exact_columns(
     """
     shown = target.forward.observe_one(fit.x)
     exact = {
-        port: _response(target, fit, found.ports, port, np.moveaxis(own, 1, 0), shown)
+        port: _response(target, fit, linear.ports, port, np.moveaxis(own, 1, 0), shown)
         for port, own in features.items()
-        if port not in found.exact
+        if port not in linear.exact
     }
-    return replace(found, exact={**found.exact, **exact})
+    return replace(linear, exact={**linear.exact, **exact})
 
 
-def under(found: Responses, judge: FitTarget, other: FitTarget) -> Responses:
+def under(linear: Responses, fit_target: FitTarget, other: FitTarget) -> Responses:
     """The same responses in deviations of the noise of another target; residual and slopes are unchanged."""
-    if judge.known is None:  # it has the measurement noise, which is kept
-        return found
+    if fit_target.known is None:  # it has the measurement noise, which is kept
+        return linear
 
     def each(part: Float[np.ndarray, "group value k"]) -> Float[np.ndarray, "group value k"]:
-        white = rewhitened(judge, other, np.moveaxis(part, 2, 0).reshape(part.shape[2], -1))
+        white = rewhitened(fit_target, other, np.moveaxis(part, 2, 0).reshape(part.shape[2], -1))
         return np.moveaxis(white.reshape(part.shape[2], *part.shape[:2]), 0, 2)
 
-    whitened = {port: each(part) for port, part in found.whitened.items()}
-    exact = {port: each(part) for port, part in found.exact.items()}
-    return replace(found, whitened=whitened, exact=exact, noise=noise_share(other))
+    whitened = {port: each(part) for port, part in linear.whitened.items()}
+    exact = {port: each(part) for port, part in linear.exact.items()}
+    return replace(linear, whitened=whitened, exact=exact, noise=noise_share(other))
 
 
 def _time_step(forward: Any) -> float:
@@ -220,13 +220,13 @@ def on_splines(basis: Splines, values: Float[np.ndarray, "*batch row"]) -> Float
 
 
 def feature_columns(
-    found: Responses, port: Port, features: Float[np.ndarray, "group feature member row"]
+    linear: Responses, port: Port, features: Float[np.ndarray, "group feature member row"]
 ) -> Float[np.ndarray, "group value feature"]:
     """Effects of features on the whitened data at all members of a port, each as a signal of its own size."""
-    if port in found.exact:
-        return found.exact[port]
-    near = np.moveaxis(on_splines(found.basis, features), 1, 3)  # group, member, spline, feature
-    return sum(found.whitened[member] @ near[:, k] for k, member in enumerate(found.ports.members(port)))
+    if port in linear.exact:
+        return linear.exact[port]
+    near = np.moveaxis(on_splines(linear.basis, features), 1, 3)  # group, member, spline, feature
+    return sum(linear.whitened[member] @ near[:, k] for k, member in enumerate(linear.ports.members(port)))
 
 
 def signal_sizes(features: Float[np.ndarray, "group feature member row"]) -> Float[np.ndarray, " feature"]:

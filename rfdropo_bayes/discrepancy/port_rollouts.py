@@ -143,8 +143,8 @@ class FeatureTable:
         """
         once, again = distinct([theta, *map(np.asarray, jax.tree.leaves(commands))])
         lanes = (theta[once], commands.of(once))
-        found = in_chunks(lambda own: self._paths(*own), lanes, (self.lanes.width,), before=check)
-        return np.asarray(found)[again]
+        features = in_chunks(lambda own: self._paths(*own), lanes, (self.lanes.width,), before=check)
+        return np.asarray(features)[again]
 
     def levels(self, theta: Float[np.ndarray, "lane physical"], commands: Commands) -> np.ndarray:
         """Commands that reach the ports, without signals (lane, row, channel)."""
@@ -156,9 +156,9 @@ class FeatureTable:
     ) -> Float[np.ndarray, "lane feature row"]:
         """Features, all by default; computed once for lanes with the same commands."""
         once, again = distinct([levels])
-        found = in_chunks(lambda own: self._values(*own), (levels[once],), chunk_sizes(self.lanes.width))
+        features = in_chunks(lambda own: self._values(*own), (levels[once],), chunk_sizes(self.lanes.width))
         places = slice(None) if chosen is None else [self.features.index(feature) for feature in chosen]
-        return np.asarray(found)[:, places][again]
+        return np.asarray(features)[:, places][again]
 
 
 @partial(jax.jit, static_argnames=("port", "ports"))
@@ -178,8 +178,8 @@ def signals_of(ports: PortMap, acting: Sequence[tuple[Port, Signals]]) -> Any:
         return None
     # Ports are hashable without the mapping of excluded ports.
     plain = ports._replace(left_out=())  # type: ignore[arg-type]
-    found = [_port_signals(plain, port, w) for port, w in given]
-    return jax.tree.map(lambda *parts: np.sum([np.asarray(part) for part in parts], axis=0), *found)
+    signals = [_port_signals(plain, port, w) for port, w in given]
+    return jax.tree.map(lambda *parts: np.sum([np.asarray(part) for part in parts], axis=0), *signals)
 
 
 def as_sensed(
@@ -255,7 +255,7 @@ class PortedForward(Forward):
         for term in terms:
             own[term.spec.name] = own[term.spec.name] * np.tile(term.scope.has(self.recordings), len(points))
         parts = [(t, m) for t in terms if not t.feature.of_motion for m in self.ports.members(t.port)]
-        found: dict[Port, Signals] = {}
+        by_port: dict[Port, Signals] = {}
         if parts:
             levels = self.table.levels(flat, commands)
             fixed = [(term, member) for term, member in parts if term.shape is None]
@@ -267,13 +267,13 @@ class PortedForward(Forward):
                 if t.shape is not None
             ]
             for term, member, w in signals:
-                found[member] = found.get(member, 0.0) + own[term.spec.name][:, None] * w
+                by_port[member] = by_port.get(member, 0.0) + own[term.spec.name][:, None] * w
         following = [term for term in terms if term.feature.of_motion]
-        acting = found
+        acting = by_port
         for _ in range(PASSES if following else 0):
             signals = signals_of(self.ports, list(acting.items()))
             values = self.table.over_motion(flat, commands._replace(signals=signals), self.deadline.check)
-            acting = dict(found)
+            acting = dict(by_port)
             for term in following:
                 w = own[term.spec.name][:, None] * values[:, self.table.of_motion.index(term.feature)]
                 acting[term.port] = acting.get(term.port, 0.0) + w
@@ -285,15 +285,15 @@ class PortedForward(Forward):
         signals = signals_of(self.ports, self._acting(theta, commands, points, moving))
         return flat, start, commands._replace(signals=signals)
 
-    def _as_seen(self, found: Fields, theta: np.ndarray, points: Points) -> Fields:
+    def _as_seen(self, fields: Fields, theta: np.ndarray, points: Points) -> Fields:
         seen_by = [term for term in self.terms if term.port.stage == "sensing"]  # they do not move the body
         if not seen_by:
-            return found
+            return fields
         commands = self.commands.of(np.tile(np.arange(self.count), len(points)))
         acting = self._acting(theta, commands, points, seen_by)
         shift = self._offset(theta).reshape(-1, 1, 1, 3)  # of the measuring frame, which comes last
-        seen = as_sensed(acting, found["position"] - shift, commands, self.table.time_step)
-        return {**found, "position": seen + shift}
+        seen = as_sensed(acting, fields["position"] - shift, commands, self.table.time_step)
+        return {**fields, "position": seen + shift}
 
 
 def with_laws_of(own: Forward, forward: Forward) -> Forward:

@@ -59,10 +59,12 @@ def prequential(target: FitTarget, fit: Fit) -> Prequential:
         rows = slice(start, end)
         used = valid[:, rows]
         r, j = residual[:, rows][used], slopes[:, rows][used]
-        left = r - j @ mean
+        remaining = r - j @ mean
         after = precision + j.T @ j
-        gain = np.linalg.solve(after, j.T @ left)
-        square = float(left @ left - (j.T @ left) @ gain)  # left' (I + J P J')^-1 left, by Woodbury's identity
+        gain = np.linalg.solve(after, j.T @ remaining)
+        square = float(
+            remaining @ remaining - (j.T @ remaining) @ gain
+        )  # left' (I + J P J')^-1 left, by Woodbury's identity
         growth = float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(precision)[1])
         scores.append(-0.5 * (square + growth + len(r) * np.log(2.0 * np.pi)))
         p.append(max(float(chi2.sf(square, len(r))), float(np.finfo(float).tiny)) if len(r) else 1.0)
@@ -80,27 +82,27 @@ def span_in_words(first: float, last: float, timed: bool) -> str:
     return f"from {first:.4g} to {last:.4g} s" if timed else f"from row {first:.0f} to row {last:.0f}"
 
 
-def in_words(found: Prequential, markers: tuple[str, ...], level: float, timed: bool = True) -> str:
+def in_words(scores: Prequential, markers: tuple[str, ...], level: float, timed: bool = True) -> str:
     """When the model first fails, when most, and at which marker.
 
     Args:
-        found: the scores.
+        scores: scores of the blocks.
         markers: names, three channels each.
         level: level of the p-values, shared by all blocks.
         timed: whether rows have times.
     """
-    failing = np.flatnonzero(found.p <= level / len(found.p))
+    failing = np.flatnonzero(scores.p <= level / len(scores.p))
     if len(failing) == 0:
         return "No stretch of rows is surprising by itself, given the earlier rows."
-    first, worst = failing[0], int(np.argmax(found.surprise))
-    at = int(np.argmax(found.misfit.reshape(-1, 3).sum(axis=1)))
-    share = "in every block" if len(failing) == len(found.p) else f"in {len(failing)} of {len(found.p)} blocks"
-    early, late = (span_in_words(*found.edges[k : k + 2], timed) for k in (first, worst))
+    first, worst = failing[0], int(np.argmax(scores.surprise))
+    at = int(np.argmax(scores.misfit.reshape(-1, 3).sum(axis=1)))
+    share = "in every block" if len(failing) == len(scores.p) else f"in {len(failing)} of {len(scores.p)} blocks"
+    early, late = (span_in_words(scores.edges[k], scores.edges[k + 1], timed) for k in (first, worst))
     return f"The model fails {share} of rows, first {early}, most {late}, and most at marker {markers[at]}." + (
-        f" {BEGINNING}" if begins_wrong(found, level) else ""
+        f" {BEGINNING}" if begins_wrong(scores, level) else ""
     )
 
 
-def begins_wrong(found: Prequential, level: float) -> bool:
+def begins_wrong(scores: Prequential, level: float) -> bool:
     """Whether the first block of rows fails, and no other of several."""
-    return len(found.p) > 1 and np.flatnonzero(found.p <= level / len(found.p)).tolist() == [0]
+    return len(scores.p) > 1 and np.flatnonzero(scores.p <= level / len(scores.p)).tolist() == [0]

@@ -92,15 +92,15 @@ class _Part(NamedTuple):
 
 
 def _parts(seen: Bool[np.ndarray, "group row"], unit: Autoregression) -> list[_Part]:
-    found = []
+    parts = []
     patterns, place = np.unique(seen, axis=0, return_inverse=True)
     for number, pattern in enumerate(patterns):
         if pattern.any():
             count = len(pattern)
             valid = np.broadcast_to(pattern[:, None], (count, count, 1))
             white = unit.whiten(np.eye(count)[:, :, None], valid)[..., 0].T
-            found.append(_Part(np.flatnonzero(place.reshape(-1) == number), pattern, white[pattern][:, pattern]))
-    return found
+            parts.append(_Part(np.flatnonzero(place.reshape(-1) == number), pattern, white[pattern][:, pattern]))
+    return parts
 
 
 def _gains(
@@ -112,8 +112,8 @@ def _gains(
     power = np.einsum("rk,grc->gkc", vectors, own) ** 2
     gains = []
     for amplitude in amplitudes:
-        spread = 1.0 + (amplitude * weight[part.groups][:, None]) ** 2 * np.maximum(values, 0.0)
-        gain = -0.5 * np.sum(power / spread[:, :, None] - power) - 0.5 * data.shape[2] * np.sum(np.log(spread))
+        variance = 1.0 + (amplitude * weight[part.groups][:, None]) ** 2 * np.maximum(values, 0.0)
+        gain = -0.5 * np.sum(power / variance[:, :, None] - power) - 0.5 * data.shape[2] * np.sum(np.log(variance))
         gains.append(float(gain))
     return np.array(gains)
 
@@ -128,6 +128,6 @@ def _posterior(
         total = scale * whitener @ across[part.seen] + np.eye(len(whitener))
         gain = np.linalg.solve(total, across.T).T
         means.append(gain @ series)
-        left = amplitude**2 - np.einsum("ij,ij->i", gain, across)
-        deviations.append(np.sqrt(np.maximum(left, 0.0))[:, None] * np.ones(series.shape[1]))
+        variance = amplitude**2 - np.einsum("ij,ij->i", gain, across)
+        deviations.append(np.sqrt(np.maximum(variance, 0.0))[:, None] * np.ones(series.shape[1]))
     return np.stack(means), np.stack(deviations)

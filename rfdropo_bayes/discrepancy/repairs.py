@@ -1,9 +1,9 @@
 """Repairs of errors of a stepwise search.
 
 `paying_pair`, if the best step leaves more than twice the noise's variance: compliance and pretension of cables pay
-    only together. `climbed_again`, before a step joins: a candidate must not be named for an effect of base parameters,
-    or for continuing an optimisation that stopped early. `without_needless`, after a further step: a first lag may
-    vanish after a delay and another lag are found, since a mixture of two causes may be named before either.
+    only together. `optimised_again`, before a step joins: a candidate must not be named for an effect of base
+    parameters, or for continuing an optimisation that stopped early. `without_needless`, after a further step: a first
+    lag may vanish after a delay and another lag are found, since a mixture of two causes may be named before either.
 
 Two more concern single refits, see `ExtensionSearch`: all sizes of an amplitude are tried, as time shifts have an
 optimum at every jump of a command; and a misspecified model is also optimised from a distant start.
@@ -19,15 +19,15 @@ from jaxtyping import Float, Int
 
 from rfdropo_bayes.discrepancy.candidates import start_together
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, WIDER, Added, ExtensionSearch
-from rfdropo_bayes.discrepancy.fit import Fit, best_between, climb, heights
-from rfdropo_bayes.discrepancy.inadequacy import far_off
+from rfdropo_bayes.discrepancy.fit import Fit, best_between, heights, optimise
+from rfdropo_bayes.discrepancy.inadequacy import misspecified
 from rfdropo_bayes.discrepancy.score import joint_statistic
-from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow
+from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
 
 PAIRS = 3  # that are refitted
 
 
-def paying_pair(search: ExtensionSearch, found: Screen, named: Sequence[str], single: Added | None) -> list[Added]:
+def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str], single: Added | None) -> list[Added]:
     """Two mechanisms at once, if the best leaves most of a large misfit; empty if they do not pay.
 
     Pairs are ranked by the linear model, and the leading pairs are refitted.
@@ -40,11 +40,11 @@ def paying_pair(search: ExtensionSearch, found: Screen, named: Sequence[str], si
     """
     if search.room(len(named)) < 2:
         return []
-    fit, last, target = found.fit, single.fit if single else found.fit, search.target
+    fit, last, target = tests.fit, single.fit if single else tests.fit, search.target
     taken = float(fit.residual @ fit.residual - last.residual @ last.residual)
-    if not far_off(single.judge if single else target, last.x):
+    if not misspecified(single.fit_target if single else target, last.x):
         return []
-    rows = {row.name: row for row in found.rows if row.probe is not None and row.name != DISCRETISATION}
+    rows = {row.name: row for row in tests.rows if row.probe is not None and row.name != DISCRETISATION}
     heads = sorted(rows.values(), key=lambda row: -row.lm)[: search.rules.members]
     drops = {
         tuple(sorted((a.name, b.name))): joint_statistic(a.probe.mark, b.probe.mark, fit.residual)
@@ -67,24 +67,24 @@ def paying_pair(search: ExtensionSearch, found: Screen, named: Sequence[str], si
         return []
     alone = {name: search.refit(fit, rows[name]) for name in best}
     first, second = sorted(best, key=lambda name: -alone[name].log_evidence)
-    between = search.screened(alone[first], [*named, first])
+    between = search.score_tests(alone[first], [*named, first])
     gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
     return [
-        Added(first, (first,), found, alone[first], gains[0], single.refits if single else {}, target),
+        Added(first, (first,), tests, alone[first], gains[0], single.refits if single else {}, target),
         Added(second, (second,), between, fits[best], gains[1], {}, target),
     ]
 
 
-def _refit_pair(search: ExtensionSearch, fit: Fit, rows: Sequence[ScreenRow]) -> Fit:
+def _refit_pair(search: ExtensionSearch, fit: Fit, rows: Sequence[ScoreRow]) -> Fit:
     """The model of a fit with two candidates in it."""
     probes = [row.probe for row in rows if row.probe is not None]
     chosen = [c.indices for c in search.candidates if c.name in [row.name for row in rows]]
-    held = [index for probe in probes for index in probe.point]
-    start = best_between(search.target, fit.x, start_together(fit, probes), held, SHARES)
-    return climb(search.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
+    constant = [index for probe in probes for index in probe.point]
+    start = best_between(search.target, fit.x, start_together(fit, probes), constant, SHARES)
+    return optimise(search.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
 
 
-def climbed_again(search: ExtensionSearch, step: Added) -> Fit | None:
+def optimised_again(search: ExtensionSearch, step: Added) -> Fit | None:
     """The model before a step, optimised again from the step's result; None if that is no better."""
     before, target = step.before.fit, search.target
     free, added = step.fit.free, np.setdiff1d(step.fit.free, before.free)
@@ -98,7 +98,7 @@ def climbed_again(search: ExtensionSearch, step: Added) -> Fit | None:
     imitated = emptied.copy()
     imitated[before.free] += np.linalg.lstsq(step.fit.jacobian[:, own], done, rcond=1e-6)[0]
     starts = np.clip(np.stack([emptied, imitated]), *target.forward.coordinates.bounds)
-    again = climb(target, starts[int(np.argmax(heights(target, starts, "without")))], before.free)
+    again = optimise(target, starts[int(np.argmax(heights(target, starts, "without")))], before.free)
     return again if again.log_evidence > before.log_evidence + 1.0 else None
 
 
@@ -116,7 +116,7 @@ def without_needless(search: ExtensionSearch, base: Fit, steps: Sequence[Added])
         emptied[gone] = null[gone]
         if _nats_to(last.fit, emptied, gone) > TOLD_APART:
             continue
-        if climb(last.judge, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
+        if optimise(last.fit_target, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
             search.report(f"{steps[index].name} is no longer needed")
             return without_needless(search, base, without(search, steps, index, base))
     return tuple(steps)
@@ -127,15 +127,15 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
     candidate, null = search.candidate(steps[index].name), search.target.forward.coordinates.null
     assert candidate is not None
     gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
-    found, judges = list(steps[:index]), [step.judge for step in steps[: index + 1]]
+    kept, fit_targets = list(steps[:index]), [step.fit_target for step in steps[: index + 1]]
     for step in steps[index + 1 :]:
-        before, start = found[-1].fit if found else base, step.fit.x.copy()
+        before, start = kept[-1].fit if kept else base, step.fit.x.copy()
         start[gone] = null[gone]
-        fit = climb(step.judge, start, np.setdiff1d(step.fit.free, gone))
-        under = climb(step.judge.on(judges[-1].forward), before.x, before.free)
-        judges.append(step.judge)
-        found.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
-    return tuple(found)
+        fit = optimise(step.fit_target, start, np.setdiff1d(step.fit.free, gone))
+        under = optimise(step.fit_target.on(fit_targets[-1].forward), before.x, before.free)
+        fit_targets.append(step.fit_target)
+        kept.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
+    return tuple(kept)
 
 
 def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:

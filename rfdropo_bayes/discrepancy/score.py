@@ -36,23 +36,23 @@ def span(jacobian: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n rank"]:
     columns = jacobian[:, size > 0] / size[size > 0]
     if columns.shape[1] == 0:
         return np.zeros((len(jacobian), 0))
-    left, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, values > RANK_TOLERANCE * values[0]]
+    vectors, values, _ = np.linalg.svd(columns, full_matrices=False)
+    return vectors[:, values > RANK_TOLERANCE * values[0]]
 
 
 def project_out(base: Float[np.ndarray, "n rank"], columns: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """Columns less their part in the span of an orthonormal basis."""
-    left = columns - base @ (base.T @ columns)
-    return left - base @ (base.T @ left)  # twice, so that rounding leaves nothing either
+    remaining = columns - base @ (base.T @ columns)
+    return remaining - base @ (base.T @ remaining)  # twice, so that rounding leaves nothing either
 
 
 def signature(base: Float[np.ndarray, "n rank"], columns: Float[np.ndarray, "n k"], sign: int = 0) -> Signature:
     """The visible part of a candidate's directions, each column is the effect of a prior-sized change."""
-    left = project_out(base, columns)
-    if left.shape[1] == 1:
-        size = float(np.linalg.norm(left))
-        return Signature(left / size, sign) if size > VISIBLE else Signature(left[:, :0], 0)
-    vectors, values, _ = np.linalg.svd(left, full_matrices=False)
+    visible = project_out(base, columns)
+    if visible.shape[1] == 1:
+        size = float(np.linalg.norm(visible))
+        return Signature(visible / size, sign) if size > VISIBLE else Signature(visible[:, :0], 0)
+    vectors, values, _ = np.linalg.svd(visible, full_matrices=False)
     return Signature(vectors[:, values > max(VISIBLE, 1e-3 * values[0])], 0)
 
 
@@ -90,8 +90,8 @@ def likeness(first: Signature, second: Signature) -> float:
 
 def classes(marks: list[Signature], limit: float) -> list[list[int]]:
     """For each signature the indistinguishable signatures: likeness above ``limit``, itself first."""
-    found = []
+    classes_found = []
     for i, mark in enumerate(marks):
         others = [j for j, other in enumerate(marks) if j != i and likeness(mark, other) > limit]
-        found.append([i, *others])
-    return found
+        classes_found.append([i, *others])
+    return classes_found

@@ -16,7 +16,7 @@ from rfdropo_bayes.discrepancy.law_words import law_sentence, ports_sentence
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.prequential import BEGINNING, begins_wrong, prequential
 from rfdropo_bayes.discrepancy.prior_ends import in_words
-from rfdropo_bayes.discrepancy.screen import p_in_words
+from rfdropo_bayes.discrepancy.score_tests import p_in_words
 from rfdropo_bayes.discrepancy.verdict import EXPLAINED, NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED, unclear
 
 MOST_EXCLUDED = 3
@@ -66,14 +66,14 @@ def _stopped(answer: Answer) -> str:
     cost = answer.cost
     if not cost.stopped:
         return ""
-    left = f" Not done: {'; '.join(map(spoken, cost.left))}." if cost.left else ""
+    not_done = f" Not done: {'; '.join(map(spoken, cost.unfinished))}." if cost.unfinished else ""
     if cost.stopped == INTERRUPT:
-        return f" The audit was stopped after {cost.seconds:.0f} s: these are its results so far.{left}"
+        return f" The audit was stopped after {cost.seconds:.0f} s: these are its results so far.{not_done}"
     minutes, waited = answer.problem.rules.minutes, round(cost.waited / 60.0)
     busy = f" For {waited} of them the audit waited for processors that other programs held." if waited else ""
     return (
         f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
-        f"go on with --resume.{left}{busy}"
+        f"go on with --resume.{not_done}{busy}"
     )
 
 
@@ -129,8 +129,8 @@ def _beginning(answer: Answer) -> str:
     """Question to the user if the base model fails in the first block of rows only."""
     if answer.verdict == NO_DISCREPANCY or not answer.converged:
         return ""
-    found = prequential(answer.target, answer.base)
-    return f" {BEGINNING}" if begins_wrong(found, answer.problem.rules.base_passes) else ""
+    scores = prequential(answer.target, answer.base)
+    return f" {BEGINNING}" if begins_wrong(scores, answer.problem.rules.base_passes) else ""
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
@@ -147,7 +147,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             "No discrepancy: the base model's residuals are consistent with noise in these data (joint "
             f"test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
         )
-    if not findings and answer.causes.screens[0].omnibus.p > answer.problem.rules.base_passes:
+    if not findings and answer.causes.test_series[0].omnibus.p > answer.problem.rules.base_passes:
         distance = 1e3 * noise_distance(answer.target.noise.first)
         return (
             f"The base model's residuals, {distance:.2g} mm, change too slowly to be measurement noise, "
@@ -180,7 +180,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
         head = f"{named} explain{'s' if len(findings) == 1 else ''} {share}"
-    elif answer.causes.screens[-1].omnibus.p > answer.problem.rules.extended_passes:
+    elif answer.causes.test_series[-1].omnibus.p > answer.problem.rules.extended_passes:
         head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
         head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
@@ -202,8 +202,8 @@ def _leading(answer: Answer) -> str:
     if refits:
         brings = ", ".join(f"{spoken(name)} {gained:.0f} nats" for name, gained in refits)
         return f"no refitted candidate has the required evidence ({brings})"
-    seen = [row for row in answer.causes.screens[0].rows if row.adjusted_p <= answer.problem.rules.family]
-    if not answer.causes.screens[0].rows:
+    seen = [row for row in answer.causes.test_series[0].rows if row.adjusted_p <= answer.problem.rules.family]
+    if not answer.causes.test_series[0].rows:
         return "no candidate was tested"
     if not seen:
         return "no candidate is significant"
@@ -212,12 +212,14 @@ def _leading(answer: Answer) -> str:
 
 def _unconverged(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     """Note if the last fit has not converged."""
-    left = answer.extended.residual
-    squares = f"sum of squares {left @ left:.3g} for {np.count_nonzero(left)} values, and better points beside it"
+    residual = answer.extended.residual
+    squares = (
+        f"sum of squares {residual @ residual:.3g} for {np.count_nonzero(residual)} values, and better points beside it"
+    )
     remedy = "Start from a calibration with --from, narrow the priors, or shorten [simulator] time_step."
     if not findings:
-        found = f" {_leading(answer).capitalize()}." if answer.causes.screens[0].rows else ""
-        return f"No verdict: the fit of the base model has not converged ({squares}).{found} {remedy}"
+        leading = f" {_leading(answer).capitalize()}." if answer.causes.test_series[0].rows else ""
+        return f"No verdict: the fit of the base model has not converged ({squares}).{leading} {remedy}"
     named = " and ".join(_named(finding) for finding in findings)
     gain = answer.validation.gain
     worth = "" if gain is None else f"; unseen recordings are missed by {_errors(gain)}"
@@ -247,7 +249,7 @@ def _invisible(answer: Answer) -> str:
     """Candidates that remain possible because the measurements cannot show them."""
     names = [
         row.name.replace("_", " ")
-        for row in answer.causes.screens[0].rows
+        for row in answer.causes.test_series[0].rows
         if row.probe is None and not answer.problem.group_of(row.name)
     ]
     if not names:
@@ -258,15 +260,15 @@ def _invisible(answer: Answer) -> str:
 
 
 def _p(answer: Answer) -> str:
-    return p_in_words(answer.causes.screens[0].omnibus.p, answer.problem.rules.bootstraps)
+    return p_in_words(answer.causes.test_series[0].omnibus.p, answer.problem.rules.bootstraps)
 
 
 def _adoption(answer: Answer) -> str:
     """Note on the adopted findings."""
     gain = answer.validation.gain
     if not answer.adopted and gain is not None and gain.opposed and not gain.worse:
-        worst, found = min(gain.against.items(), key=lambda item: item[1].elpd)
-        errors = f"{1e3 * found.rmse_base:.3g} mm without, {1e3 * found.rmse_extended:.3g} mm with it"
+        worst, recording = min(gain.against.items(), key=lambda item: item[1].elpd)
+        errors = f"{1e3 * recording.rmse_base:.3g} mm without, {1e3 * recording.rmse_extended:.3g} mm with it"
         return f" {worst} is clearly less likely with this ({errors}): extended.toml keeps the base model."
     if not answer.adopted:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
@@ -315,8 +317,8 @@ def _only_noise(answer: Answer) -> bool:
 
 
 def _pattern(answer: Answer) -> str:
-    """Result of the joint test of an extended model that fails it."""
-    rules, last = answer.problem.rules, answer.causes.screens[-1].omnibus.p
+    """Clause about an extended model that fails the joint test."""
+    rules, last = answer.problem.rules, answer.causes.test_series[-1].omnibus.p
     words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
     sure = last <= rules.base_passes and not _only_noise(answer)
     return f"{words}: something else is at work" if sure else words
@@ -333,7 +335,7 @@ def _remains(answer: Answer) -> str:
 
 
 def _resolution(answer: Answer) -> str:
-    if answer.causes.screens[0].refined:
+    if answer.causes.test_series[0].refined:
         return " on a mesh and time step twice as fine, which differ too little to be named"
     return ""
 

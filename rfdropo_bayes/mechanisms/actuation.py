@@ -311,7 +311,7 @@ class TravelStop(InCommandUnit, SteppedActuation):
     def advance(
         self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
     ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
-        """Follow the command, less all that was lost at the stops."""
+        """Follow the command, minus all motion lost at the stops."""
         release, pull = values["inverse_release_travel"], values["inverse_pull_travel"]
         lost, start = memory
         travel = given - start - lost

@@ -10,7 +10,7 @@ import numpy as np
 from rfdropo_bayes.discrepancy.omnibus import BLOCK
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.score import likeness
-from rfdropo_bayes.discrepancy.screen import Screen, ScreenRow
+from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.page import render
 from rfdropo_bayes.report.replay import Track, replay
@@ -90,7 +90,7 @@ def residuals_of(answer: Answer) -> figures.Residuals:
 def shown(answer: Answer) -> figures.Shown:
     """Data of the figures of an audit."""
     step = float(np.median(np.diff(answer.target.measurements.time[0])))
-    probed = [row for row in answer.causes.screens[0].rows if row.probe is not None][:MOST_COSINES]
+    probed = [row for row in answer.causes.test_series[0].rows if row.probe is not None][:MOST_COSINES]
     marks = [row.probe.mark for row in probed if row.probe is not None]
     unseen, validation, tracks = None, answer.validation, list[Track]()
     if validation.predictions is not None and validation.unseen is not None and validation.gain is not None:
@@ -110,7 +110,7 @@ def shown(answer: Answer) -> figures.Shown:
     rest = answer.remainder
     return figures.Shown(
         residuals_of(answer),
-        [screen.omnibus.blocks.tolist() for screen in answer.causes.screens],
+        [tests.omnibus.blocks.tolist() for tests in answer.causes.test_series],
         BLOCK * step,
         ["base model", *(f"with {display_name(step.name)}" for step in answer.causes.steps)],
         [row.name for row in probed],
@@ -125,8 +125,8 @@ def shown(answer: Answer) -> figures.Shown:
 
 def class_effects(answer: Answer) -> list[figures.ClassEffect]:
     """Effects of the leading classes of candidates on the base model's residuals, adopted or not."""
-    first, rules = answer.causes.screens[0], answer.problem.rules
-    heads: list[list[ScreenRow]] = []
+    first, rules = answer.causes.test_series[0], answer.problem.rules
+    heads: list[list[ScoreRow]] = []
     for row in first.rows:
         if row.probe is None or row.adjusted_p > rules.family:
             continue
@@ -138,14 +138,14 @@ def class_effects(answer: Answer) -> list[figures.ClassEffect]:
     return [_effect(answer, first, members) for members in heads]
 
 
-def _alike(first: ScreenRow, second: ScreenRow) -> float:
+def _alike(first: ScoreRow, second: ScoreRow) -> float:
     return likeness(first.probe.mark, second.probe.mark) if first.probe and second.probe else 0.0
 
 
-def _effect(answer: Answer, screen: Screen, members: Sequence[ScreenRow]) -> figures.ClassEffect:
+def _effect(answer: Answer, tests: ScoreTests, members: Sequence[ScoreRow]) -> figures.ClassEffect:
     """The linear effect of the leading member of a class at the size that explains most."""
     assert members[0].probe is not None
-    measured, basis, residual = answer.target.measurements, members[0].probe.mark.basis, screen.fit.residual
+    measured, basis, residual = answer.target.measurements, members[0].probe.mark.basis, tests.fit.residual
     both = [
         measured.series(each)[..., : measured.markers] ** 2
         for each in (residual, residual - basis @ (basis.T @ residual))
@@ -169,14 +169,14 @@ def _effect(answer: Answer, screen: Screen, members: Sequence[ScreenRow]) -> fig
 def _signal(answer: Answer) -> figures.Signal | None:
     """The signal at the port of the law, of its members the one of most evidence; without a law at the port of most."""
     described = answer.causes.described
-    if described is None or not described.found.significant(answer.problem.rules.family):
+    if described is None or not described.search.significant(answer.problem.rules.family):
         return None
-    row, terms = described.found.ports[0], described.found.terms
+    row, terms = described.search.ports[0], described.search.terms
     if terms:
-        members = described.found.map.members(terms[0].term.port)
-        row = next(each for each in described.found.ports if each.port in members)
+        members = described.search.map.members(terms[0].term.port)
+        row = next(each for each in described.search.ports if each.port in members)
     names = answer.target.measurements.names
-    return figures.Signal(row.port.words, row.port.unit, names, described.found.centre, row.mean, row.sd)
+    return figures.Signal(row.port.words, row.port.unit, names, described.search.centre, row.mean, row.sd)
 
 
 def _caption(effect: figures.ClassEffect) -> str:

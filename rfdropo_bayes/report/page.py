@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from rfdropo_bayes.discrepancy.candidates import spoken
-from rfdropo_bayes.discrepancy.screen import p_in_words
+from rfdropo_bayes.discrepancy.score_tests import p_in_words
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.posteriors.bounds import PILED
 from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures

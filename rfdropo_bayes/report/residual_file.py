@@ -17,7 +17,7 @@ def residual_dataset(answer: Answer) -> xr.Dataset:
     measured, markers = answer.target.measurements, answer.problem.model.recordings.markers
     models: dict[str, Any] = {"base": (answer.target, answer.base.x), "last": (answer.target, answer.extended.x)}
     if answer.causes.steps:
-        models["last"] = (answer.causes.steps[-1].judge, answer.extended.x)
+        models["last"] = (answer.causes.steps[-1].fit_target, answer.extended.x)
     if answer.law is not None and answer.law.last is not None:
         models["last"] = (answer.law.last.target, answer.law.last.fit.x)
     valid = measured.valid[..., : measured.markers]
@@ -32,8 +32,8 @@ def residual_dataset(answer: Answer) -> xr.Dataset:
     coordinates: dict[str, Any] = {"recording": list(measured.names), "marker": list(markers), "axis": list("xyz")}
     described = answer.causes.described
     if described is not None:
-        rows = described.found.ports
-        coordinates |= {"port": [row.port.name for row in rows], "signal_time": described.found.centre}
+        rows = described.search.ports
+        coordinates |= {"port": [row.port.name for row in rows], "signal_time": described.search.centre}
         coordinates |= {"unit": ("port", [row.port.unit for row in rows])}
         across = ("port", "recording", "signal_time")
         variables["signal"] = (across, np.stack([row.mean for row in rows]), {})

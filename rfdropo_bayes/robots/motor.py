@@ -20,7 +20,7 @@ class Motor(RobotTable):
 
     channel: Name = Field(description="command channel of the motor")
     node: int = Field(ge=1, le=127, description="CANopen node of the drive")
-    axis: int = Field(default=1, ge=1, le=8, description="axis of that node, for drives of several motors")
+    axis: int = Field(default=1, ge=1, le=8, description="axis of the node, for drives of several motors")
     sign: int = Field(description="+1 if counts rise as the cable is pulled, else -1")
     drum_radius_m: Positive = Field(description="radius at which the cable is wound")
     gear: Positive = Field(description="turns of the motor per turn of the drum")

@@ -25,6 +25,7 @@ base's radius has twice this number (.6 %), and at .3 four times this number (.4
 """
 DRIVES = {"Pa": ("chamber", "pressure")}  # words for a drive and its command, if they are not a cable and its pull
 COMMANDS = ("m", "rad", "N", "N m", "Pa", "-")
+DISK_THICKNESS = 0.003  # [m]
 CHAMBER_RADIUS = 0.2  # radius of a chamber over the body's, if it is not given
 VACUUM = -101325.0  # [Pa] Least pressure above the surroundings
 USUAL_PULL = 0.15  # usual pull of a cable over the body's length
@@ -46,7 +47,6 @@ class RobotOutline:
     tip_radius: float | None = None
     inner_radius: float | None = None
     disks: int | None = None
-    disk_thickness: float = 0.003
     segments: int = 1  # number of segments, each with cables that end at its end
     cables: int = 4  # number of cables, or of chambers, per segment, evenly around it
     # distance of the cables from the axis at the base, which follow the taper; or of the chambers
@@ -121,7 +121,7 @@ class RobotOutline:
                 length_m=self.length,
                 disks=self.number_of_disks,
                 radius_m=self.radius,
-                thickness_m=self.disk_thickness,
+                thickness_m=DISK_THICKNESS,
                 backbone_radius_m=self.inner_radius or 0.2 * self.radius,
             )
         return Cylinder(length_m=self.length, layers=layers, radius_m=self.radius)

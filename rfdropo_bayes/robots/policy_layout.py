@@ -60,7 +60,7 @@ class PolicyLayout:
         if self.kind == "continuous" and len(self.moves) != 1:
             raise InputError("a continuous action needs one row of moves", where=self.task)
         if self.period_s <= 0 or any(low > high for low, high in zip(self.low, self.high, strict=True)):
-            raise InputError("the period must be positive and each limit's ends in order", where=self.task)
+            raise InputError("the period must be positive, and limits must be [least, greatest]", where=self.task)
 
     @property
     def size(self) -> int:

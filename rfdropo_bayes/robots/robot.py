@@ -235,7 +235,7 @@ class Robot(RobotTable):
         Args:
             answers: ``name``; ``length`` and ``radius`` (at the base) of the body; ``markers``, heights along the axis
                 by name. These four are required. ``shape``: "cylinder", "cone" (with ``tip_radius``), "tube" (with
-                ``inner_radius``), or "disks" on a backbone of ``inner_radius`` (``disks`` of ``disk_thickness``).
+                ``inner_radius``), or "disks" on a backbone of ``inner_radius`` (``disks`` of 3 mm).
                 ``segments`` of ``segment_lengths`` (equal by default), each with its own ``cables`` evenly around it,
                 from ``segment_azimuths`` [deg] on (``azimuth_evidence`` and ``size_evidence``: reasons for these, and
                 for the sizes), at ``cable_radius`` from the axis at the base; with ``pairs`` opposite cables share a

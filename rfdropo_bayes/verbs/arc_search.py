@@ -163,7 +163,7 @@ class ArcSearch:
         return arrangement
 
     def turned_far(self, arrangement: Arrangement) -> Arrangement:
-        """The same, from wherever they are: each section in turn is tried all around."""
+        """The arrangement after a search over all azimuths of each section in turn."""
         for section in range(self.sections.number):
             tried = [_with_turn(arrangement, section, angle) for angle in self.azimuths]
             arrangement = tried[int(np.argmax(self.score_of(tried)))]

@@ -323,7 +323,7 @@ def _with_own(
     space, own = with_fixed_quantities(model.scopes, plain, tuple(model.scopes.fixed))
     if groups is not None:
         space, candidates = with_differences(
-            space, base, plain, candidates, groups, spreads=spreads, held=tuple(model.scopes.fixed)
+            space, base, plain, candidates, groups, spreads=spreads, fixed=tuple(model.scopes.fixed)
         )
     return replace(model, scopes=space), [*candidates, *own]
 

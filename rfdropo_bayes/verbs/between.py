@@ -144,7 +144,7 @@ def extend_groups(model: dict[str, Any], answer: Answer, candidate: Candidate) -
 def confine_laws(model: dict[str, Any], answer: Answer) -> None:
     """Say in the table [model] of an experiment file which groups have the terms of a law that act in one alone."""
     groups, law = answer.problem.groups, answer.law
-    for refit in [] if law is None else law.found.terms:
+    for refit in [] if law is None else law.search.terms:
         group = refit.term.scope.group
         if group and groups is not None:
             model["groups"] = _naming({group: groups.members[group]}, model.get("groups", {}))

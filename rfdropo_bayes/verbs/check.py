@@ -413,10 +413,10 @@ def _ranges(model: TrajectoryModel) -> dict[str, tuple[float, float]]:
 
 
 def _see_candidates(spec: ModelSpec, table: AuditTable) -> None:
-    """See that an audit would find the mechanisms that [audit] names.
+    """Check that the mechanisms named in [audit] exist.
 
     Raises:
-        InputError: it would not.
+        InputError: a mechanism does not exist.
     """
     names = candidate_names(spec, table)
     mechanisms_named(names, spec.robot, folder=spec.folder, where="[audit] candidates")

@@ -27,7 +27,7 @@ from rfdropo_bayes.discrepancy.extension import DISCRETISATION, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.inadequacy import seen_under
 from rfdropo_bayes.discrepancy.law_search import Refit, law_search
-from rfdropo_bayes.discrepancy.screen import Screen
+from rfdropo_bayes.discrepancy.score_tests import ScoreTests
 from rfdropo_bayes.inference.progress import say_lines
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import hashes, run_folder
@@ -132,9 +132,9 @@ def _design(
     target, fitted = base_model(problem, problem.seed, report=report, deadline=clock)
     report("base model fitted")
     search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed)
-    scores: Screen | None = None
+    scores: ScoreTests | None = None
     with clock.part(SCREENED_BY, SCREENING):
-        scores = search.screened(fitted)
+        scores = search.score_tests(fitted)
     hypotheses = [] if scores is None else _hypotheses(search, scores, clock, report)
     wrong = scores is not None and scores.omnibus.p <= problem.rules.base_passes
     if wrong and (alternatives := _alternatives(problem, target, fitted, clock, report)):
@@ -167,7 +167,7 @@ def _design(
 
 
 def _hypotheses(
-    search: ExtensionSearch, scores: Screen, clock: Clock, report: Callable[[str], None]
+    search: ExtensionSearch, scores: ScoreTests, clock: Clock, report: Callable[[str], None]
 ) -> list[Hypothesis]:
     """The leading significant candidates, each refitted."""
     rows = [row for row in scores.rows if row.adjusted_p <= search.rules.family and row.name != DISCRETISATION]
@@ -195,7 +195,7 @@ def _alternatives(
     alternatives: list[Refit] = []
     with clock.part(LAWS_BY, "laws at ports"):
         search = replace(law_search(target, *options), most=1)
-        alternatives = search.find(target, base).rivals
+        alternatives = search.find(target, base).alternatives
     return alternatives
 
 
@@ -206,17 +206,17 @@ def _with_laws(
     with the leading law. A misspecified model would be overconfident under the measurement noise.
     """
     simulator: Any = problem.lanes.simulator
-    names, judge = tuple(simulator.channel_names), alternatives[0].target.on(target.forward)
+    names, fit_target = tuple(simulator.channel_names), alternatives[0].target.on(target.forward)
     laws = [
         Hypothesis(
             f"{refit.feature.formula(names)} at {refit.term.port.words}",
-            seen_under(refit.target, judge, refit.fit),
+            seen_under(refit.target, fit_target, refit.fit),
             refit.target.forward,
         )
         for refit in alternatives
     ]
-    own = [replace(h, fit=seen_under(target, judge, h.fit)) for h in hypotheses]
-    return judge, seen_under(target, judge, base), [*laws, *own][:HYPOTHESES]
+    own = [replace(h, fit=seen_under(target, fit_target, h.fit)) for h in hypotheses]
+    return fit_target, seen_under(target, fit_target, base), [*laws, *own][:HYPOTHESES]
 
 
 def _outlooks(
@@ -323,9 +323,9 @@ def _unfinished(clock: Clock) -> str:
     )
 
 
-def _sentence(kind: str, outlook: DesignOutlook, now: dict[tuple[str, str], float], screened: bool) -> str:
+def _sentence(kind: str, outlook: DesignOutlook, now: dict[tuple[str, str], float], score_tests: bool) -> str:
     if not outlook.pairs:
-        outcome = "No candidate is significant." if screened else "There was no time for the candidates."
+        outcome = "No candidate is significant." if score_tests else "There was no time for the candidates."
         return (
             f"{outcome} The {kind} in {COMMANDS} would tell most about the base parameters: "
             f"{outlook.information:.1f} nats."

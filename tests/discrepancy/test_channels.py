@@ -14,7 +14,7 @@ from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.pipeline import audit
 from rfdropo_bayes.discrepancy.score import span
-from rfdropo_bayes.discrepancy.screen import null_residuals
+from rfdropo_bayes.discrepancy.score_tests import null_residuals
 
 from .toys import problem_of_cables
 

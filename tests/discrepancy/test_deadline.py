@@ -52,7 +52,7 @@ def test_the_clock_counts_what_another_program_takes():
         other.communicate()
         os.sched_setaffinity(0, mine)
     assert 0.12 < waited < elapsed
-    assert clock.left == pytest.approx(clock.share - (time.monotonic() - clock.began) / 60.0, abs=1e-3)
+    assert clock.remaining == pytest.approx(clock.share - (time.monotonic() - clock.began) / 60.0, abs=1e-3)
 
 
 def test_ctrl_c_ends_what_may_be_stopped_and_is_answered_then(monkeypatch):
@@ -67,7 +67,7 @@ def test_ctrl_c_ends_what_may_be_stopped_and_is_answered_then(monkeypatch):
     assert [line.partition(":")[0] for line in lines] == ["stopping"]
     with clock.granted():
         clock.check()
-        assert 0.0 < clock.left < 1.0
+        assert 0.0 < clock.remaining < 1.0
 
 
 def test_the_time_that_is_kept_is_granted_once_the_time_is_up():
@@ -78,4 +78,4 @@ def test_the_time_that_is_kept_is_granted_once_the_time_is_up():
     assert clock.why == "time"
     clock.minutes = 10.0
     with clock.granted():
-        assert clock.left == pytest.approx(1.5, abs=0.05)
+        assert clock.remaining == pytest.approx(1.5, abs=0.05)

@@ -13,8 +13,8 @@ from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, MISFIT, REPEAT
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.base_fit import base_model, first_target, residual_noise
 from rfdropo_bayes.discrepancy.extension import ExtensionSearch
-from rfdropo_bayes.discrepancy.fit import climb
-from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, far_off, leaves_noise, spread
+from rfdropo_bayes.discrepancy.fit import optimise
+from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, leaves_noise, misspecified, residual_deviation
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.pipeline import audit
 
@@ -25,28 +25,28 @@ TRUTH = {"gain": 1.3, "bend": -0.4}
 
 @pytest.fixture(scope="module")
 def far():
-    """A problem whose base model lacks a large play, its judge and its fit."""
+    """A problem whose base model lacks a large play, the target of its fit and its fit."""
     asked = problem({**TRUTH, "play": 8.0}, 3)
     return asked, *base_model(asked, 0)
 
 
 def test_a_model_that_is_far_off_is_judged_by_the_size_of_what_it_leaves_and_no_other_is(far):
-    _, judge, fit = far
-    left = judge.errors(fit.x)
+    _, fit_target, fit = far
+    left = fit_target.errors(fit.x)
     size = np.sqrt(np.mean(left**2))
     assert size > np.sqrt(POOR) * NOISE
-    assert (judge.noise.source, judge.measured.noise.source) == (MISFIT, REPEATS)
-    np.testing.assert_allclose(spread(judge, fit), size, rtol=1e-6)
-    # Rows that last count as fewer: the judge's noise is that of white rows that would tell as much.
-    assert np.all(judge.noise.scale >= size * (1 - 0.1))
+    assert (fit_target.noise.source, fit_target.measured.noise.source) == (MISFIT, REPEATS)
+    np.testing.assert_allclose(residual_deviation(fit_target, fit), size, rtol=1e-6)
+    # Rows that last count as fewer: the noise of the fit's target is that of white rows that would tell as much.
+    assert np.all(fit_target.noise.scale >= size * (1 - 0.1))
     right, found = base_model(problem(TRUTH, 3), 0)
     assert right.known is None
-    np.testing.assert_array_equal(spread(right, found), right.noise.scale)
+    np.testing.assert_array_equal(residual_deviation(right, found), right.noise.scale)
 
 
 def test_a_fit_seen_under_the_measurements_noise_is_what_that_noise_makes_of_its_rollouts(far):
-    _, judge, fit = far
-    known, seen = judge.measured, as_measured(judge, fit)
+    _, fit_target, fit = far
+    known, seen = fit_target.measured, as_measured(fit_target, fit)
     np.testing.assert_allclose(seen.residual, known.residual(fit.x[None])[0], atol=1e-5 * np.abs(seen.residual).max())
     slopes = known.jacobian(fit.x, fit.free)
     np.testing.assert_allclose(seen.jacobian, slopes, atol=1e-5 * np.abs(slopes).max())
@@ -55,18 +55,18 @@ def test_a_fit_seen_under_the_measurements_noise_is_what_that_noise_makes_of_its
 
 def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
     """Half a nat a row for each factor e of the squared residual; the measurement's noise gives ten times as much."""
-    asked, judge, fit = far
-    search = ExtensionSearch(judge, asked.candidates, asked.rules, 0)
-    screen = search.screened(fit)
-    assert screen.omnibus.p == 1 / (1 + asked.rules.bootstraps)
-    better = search.refit(fit, screen.row("play"))
+    asked, fit_target, fit = far
+    search = ExtensionSearch(fit_target, asked.candidates, asked.rules, 0)
+    tests = search.score_tests(fit)
+    assert tests.omnibus.p == 1 / (1 + asked.rules.bootstraps)
+    better = search.refit(fit, tests.row("play"))
     rows = np.count_nonzero(fit.residual)
     shrunk = np.log((fit.residual @ fit.residual) / (better.residual @ better.residual))
     assert asked.rules.evidence < better.log_evidence - fit.log_evidence < 0.5 * rows * shrunk
-    known = judge.measured
-    alone, both = climb(known, fit.x, fit.free), climb(known, better.x, better.free)
+    known = fit_target.measured
+    alone, both = optimise(known, fit.x, fit.free), optimise(known, better.x, better.free)
     assert both.log_evidence - alone.log_evidence > 10.0 * (better.log_evidence - fit.log_evidence)
-    assert not far_off(known, both.x)
+    assert not misspecified(known, both.x)
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_
     asked, *_ = far
     answer = audit(replace(asked, rules=replace(asked.rules, bootstraps=199)))
     assert [step.name for step in answer.causes.steps] == ["play"]
-    assert answer.causes.steps[0].judge.known is None
+    assert answer.causes.steps[0].fit_target.known is None
     assert answer.verdict == "explained"
     assert answer.target.noise.source == REPEATS
     assert np.mean(answer.extended.residual**2) < 1.2 < POOR < np.mean(answer.base.residual**2)

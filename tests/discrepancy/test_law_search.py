@@ -20,7 +20,7 @@ from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.described import Described, coefficients, describe
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
-from rfdropo_bayes.discrepancy.fit import climb
+from rfdropo_bayes.discrepancy.fit import optimise
 from rfdropo_bayes.discrepancy.held_out import predicted, stages_of
 from rfdropo_bayes.discrepancy.inadequacy import POOR, as_measured, noise_share
 from rfdropo_bayes.discrepancy.law_search import TIED, LinearModel, _relinearised, law_search
@@ -112,7 +112,7 @@ class PushedAtMany(Toy):
 
 
 def searched(toy, alike=False):
-    """Problem, judge, base model and the search's findings of recordings of a toy."""
+    """Problem, fit target, base model and the search's findings of recordings of a toy."""
     question = asked(6, toy, alike)
     target, base = base_model(question, question.seed)
     options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
@@ -164,7 +164,7 @@ def test_a_model_that_is_far_off_is_told_no_size_of_a_signal(left, said):
     """There the noise is as large as what is left, and shrinks the signal to half of what it is."""
     row = SimpleNamespace(port=Port("marker tip x", "sensing", "marker", 0, 0, "m", 1e-3, ""), amplitude=0.002)
     found = SimpleNamespace(significant=lambda family: [row])
-    causes = SimpleNamespace(described=SimpleNamespace(holds=False, found=found, last=None))
+    causes = SimpleNamespace(described=SimpleNamespace(holds=False, search=found, last=None))
     problem = SimpleNamespace(rules=SimpleNamespace(family=0.02))
     answer = SimpleNamespace(causes=causes, problem=problem, extended=SimpleNamespace(residual=np.full(9, left)))
     assert said in ports_sentence(answer)
@@ -191,7 +191,7 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     said = []
     *_, found = describe(question, Named(search_of(question, target), base), None, said.append)
     assert found.holds
-    assert [refit.term.port.name for refit in found.found.terms] == ["marker m3 x"]
+    assert [refit.term.port.name for refit in found.search.terms] == ["marker m3 x"]
     assert len(found.held_out.predictions) == 2
     assert said == ["unseen recordings do not support more than 1 of 3 terms: the search ends"]
 
@@ -214,9 +214,9 @@ def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidat
     # A design of what to send next looks at both models under that noise: of that of the measurement, what either
     # leaves is a hundred times as much, and the commands at hand would seem to tell them apart many times as well.
     named = [Hypothesis("named", base)]
-    judge, seen, hypotheses = _with_laws(question, target, base, named, found.rivals)
-    assert judge.noise is term.target.noise
-    left = judge.residual(base.x[None])[0]
+    fit_target, seen, hypotheses = _with_laws(question, target, base, named, found.alternatives)
+    assert fit_target.noise is term.target.noise
+    left = fit_target.residual(base.x[None])[0]
     np.testing.assert_allclose(seen.residual, left, atol=1e-6 * np.abs(left).max())
     np.testing.assert_array_equal(hypotheses[-1].fit.residual, seen.residual)
     np.testing.assert_array_equal(hypotheses[0].fit.residual, term.fit.residual)
@@ -224,7 +224,7 @@ def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidat
     both = [hypotheses[0], hypotheses[-1]]
     measured = [as_measured(term.target, term.fit), as_measured(target, base)]
     surer = [replace(h, fit=fit) for h, fit in zip(both, measured, strict=True)]
-    (pair,), (other,) = at_hand(judge, both).values(), at_hand(judge, surer).values()
+    (pair,), (other,) = at_hand(fit_target, both).values(), at_hand(fit_target, surer).values()
     assert 10.0 * pair < other
 
 
@@ -254,18 +254,18 @@ def test_terms_are_told_apart_under_the_noise_that_the_model_with_the_best_one_l
 @pytest.mark.slow
 def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
     question = asked(6, Elsewhere())
-    judge, base = base_model(question, question.seed)
-    table = law_search(judge, question.ports, ("a", "b"), "m", 0, 0.02, lambda line: None).table
-    known = judge.measured
-    far, near = (responses(t, as_measured(judge, base), question.ports, table) for t in (judge, known))
-    seen = under(far, judge, known)
+    fit_target, base = base_model(question, question.seed)
+    table = law_search(fit_target, question.ports, ("a", "b"), "m", 0, 0.02, lambda line: None).table
+    known = fit_target.measured
+    far, near = (responses(t, as_measured(fit_target, base), question.ports, table) for t in (fit_target, known))
+    seen = under(far, fit_target, known)
     for port, part in near.whitened.items():
         assert not np.allclose(far.whitened[port], part)
         np.testing.assert_allclose(seen.whitened[port], part, atol=1e-9 * np.abs(part).max())
     assert (seen.noise, near.noise) == (1.0, 1.0)
     # Of the readings that are means of three repeats, noise is a third; the same noise over what is left, squared.
-    share = np.mean(1.0 / known.measurements.count) * float(np.mean((known.noise.scale / judge.noise.scale) ** 2))
-    assert far.noise == noise_share(judge) == pytest.approx(share)
+    share = np.mean(1.0 / known.measurements.count) * float(np.mean((known.noise.scale / fit_target.noise.scale) ** 2))
+    assert far.noise == noise_share(fit_target) == pytest.approx(share)
     assert under(near, known, known) is near
 
 
@@ -334,7 +334,9 @@ def test_commands_tell_laws_apart_that_recordings_do_not():
     target, base = base_model(given, 5)
     search = law_search(target, given.ports, ("a", "b"), "rad", 5, 0.02, lambda line: None)
     found = replace(search, most=1).find(target, base)
-    tied = {refit.term.feature.formula("ab"): refit for refit in found.rivals if refit.term.port.name == "marker m3 x"}
+    tied = {
+        refit.term.feature.formula("ab"): refit for refit in found.alternatives if refit.term.port.name == "marker m3 x"
+    }
     assert {"u_a u_a", "u_a u_b", "u_b u_b"} <= set(tied)
     hypotheses = [
         Hypothesis(name, as_measured(refit.target, refit.fit), refit.target.forward) for name, refit in tied.items()
@@ -387,7 +389,7 @@ def named_with(question, names):
     before = search_of(question, target).tested(base, 0)
     for name in names:
         free = np.union1d(fit.free, question.candidate(name).indices)
-        fit = climb(target, fit.x, free)
+        fit = optimise(target, fit.x, free)
         steps.append(Added(name, (name,), before, fit, 0.0, {}, target))
     named = Named(search_of(question, target), base, tuple(steps))
     return named, predicted(question, target.measured, stages_of(target, base, steps))
@@ -398,5 +400,5 @@ def test_mechanisms_beside_a_law_that_unseen_recordings_do_not_ask_for_stood_in_
     question = asked(6, PushedPlaying())
     *_, found = describe(question, *named_with(question, ["play", "creep", "wall"]))
     assert (found.beside, set(found.stand_ins)) == (("play",), {"creep", "wall"})
-    assert [refit.term.feature.kind for refit in found.found.terms] == ["product"]
+    assert [refit.term.feature.kind for refit in found.search.terms] == ["product"]
     assert found.holds

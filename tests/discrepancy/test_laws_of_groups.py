@@ -65,7 +65,7 @@ def test_an_unknown_effect_of_one_month_is_described_with_its_month_and_joins_th
 def test_an_unknown_effect_of_both_months_is_described_for_all_recordings():
     answer = audit(asked(("january", "april")))
     assert answer.law is not None
-    (term,) = (refit.term for refit in answer.law.found.terms)
+    (term,) = (refit.term for refit in answer.law.search.terms)
     assert (term.port.name, term.scope) == ("marker m3 x", EVERYWHERE)
     model = {}
     confine_laws(model, answer)

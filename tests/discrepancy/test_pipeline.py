@@ -28,14 +28,14 @@ from rfdropo_bayes.discrepancy.candidates import lead
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits, Rules
-from rfdropo_bayes.discrepancy.fit import climb
+from rfdropo_bayes.discrepancy.fit import optimise
 from rfdropo_bayes.discrepancy.gain import Difference, Gain
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.measurements import gather_measurements
 from rfdropo_bayes.discrepancy.naming import Named, without_each_other
 from rfdropo_bayes.discrepancy.pipeline import audit
-from rfdropo_bayes.discrepancy.repairs import climbed_again, without_needless
-from rfdropo_bayes.discrepancy.screen import p_in_words
+from rfdropo_bayes.discrepancy.repairs import optimised_again, without_needless
+from rfdropo_bayes.discrepancy.score_tests import p_in_words
 from rfdropo_bayes.discrepancy.sentence import _adoption, _named
 from rfdropo_bayes.discrepancy.verdict import decide
 from rfdropo_bayes.errors import InputError
@@ -158,7 +158,11 @@ def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
     answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 0.15}, 102)))
     assert [step.name for step in answer.causes.steps] == ["discretisation", "play"]
     assert answer.verdict == "explained"
-    assert answer.causes.steps[1].judge.forward is answer.causes.steps[0].judge.forward is not answer.target.forward
+    assert (
+        answer.causes.steps[1].fit_target.forward
+        is answer.causes.steps[0].fit_target.forward
+        is not answer.target.forward
+    )
     index = answer.problem.coordinates.names.index("play")
     sizes = answer.problem.coordinates.values(answer.draws)[:, index]
     assert abs(sizes.mean() - 0.15) < 4 * sizes.std()
@@ -171,7 +175,7 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, nam
     answer = audit(replace(asked, rules=replace(asked.rules, family=family)))
     assert [step.name for step in answer.causes.steps] == named
     assert answer.verdict == ("explained" if named else "no_discrepancy")
-    assert answer.causes.screens[0].refined is not bool(named)
+    assert answer.causes.test_series[0].refined is not bool(named)
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     if named:  # the finer simulator is the model now
         assert content["numerical_error_mm"] is None
@@ -186,7 +190,7 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, nam
 def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(left):
     """Also where the finer simulator has half of the error itself, as with time steps of first order."""
     answer = audit(on_a_coarse_mesh(problem(TRUTH, 102), SMALL, left))
-    assert answer.causes.screens[0].row("discretisation").adjusted_p < 0.02
+    assert answer.causes.test_series[0].row("discretisation").adjusted_p < 0.02
     assert answer.causes.steps == []
     assert answer.verdict == "no_discrepancy"
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
@@ -252,8 +256,8 @@ def test_commands_that_excite_only_one_of_two_effects_separate_them():
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen = search.screened(base)
-    hypotheses = [Hypothesis(name, search.refit(base, screen.row(name))) for name in ("play", "delay")]
+    tests = search.score_tests(base)
+    hypotheses = [Hypothesis(name, search.refit(base, tests.row(name))) for name in ("play", "delay")]
     like = asked.model.recordings.commands.of(0)
     still = like._replace(step=np.zeros_like(like.step))
     moving, resting = outlooks(target, base, hypotheses, [like, still])
@@ -272,7 +276,7 @@ class Hurried(Deadline):
         self.looks = looks
 
     @property
-    def left(self) -> float:
+    def remaining(self) -> float:
         return 1.0 if self.why or np.isinf(self.minutes) else float(self.looks)
 
     def check(self) -> None:
@@ -362,7 +366,7 @@ def test_a_base_model_without_the_time_for_its_fit_is_refused():
 )
 @pytest.mark.parametrize("stated", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp_path, share, stated):
-    """The time is up at the start, in the search and in the last climb; with and without a noise that is known."""
+    """The time is up at the start, in the search and in the last optimisation; with and without known noise."""
     asked = problem({**TRUTH, "play": 1.0}, 1)
     if not stated:
         asked = asked_of(asked, recordings({**TRUTH, "play": 1.0}, 1)[2:6], 2)
@@ -383,7 +387,7 @@ def test_an_audit_without_the_time_for_a_base_fit_has_no_verdict_and_goes_on(tmp
     page = render_audit(shown(answer), doubtful, "", "")
     assert "<li>run: markers change names</li>" in page
     assert "no_verdict" in page.replace(" ", "_")
-    assert ("No candidate was screened" in page) == (content["candidates"] == [])
+    assert ("No candidate was tested" in page) == (content["candidates"] == [])
     if stated and share > 0.5:
         resumed = audit(asked, journal=Journal(tmp_path, resume=True))
         assert resumed.verdict == "explained"
@@ -434,12 +438,12 @@ def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeyp
     asked = replace(problem({**TRUTH, "play": 1.0}, 1), lanes=Lanes(Brittle(), np.arange(4)))
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen = search.screened(base)
+    tests = search.score_tests(base)
     index = asked.coordinates.space.names.index("play")
     far = base.x.copy()
     far[index] += 45.0
     monkeypatch.setattr(ExtensionSearch, "_lead", lambda *given: (1.0, far))
-    fit = search.refit(base, screen.row("play"))
+    fit = search.refit(base, tests.row("play"))
     assert fit.log_evidence > base.log_evidence + 10.0
     assert asked.coordinates.named(fit.x)["play"] == pytest.approx(1.0, abs=0.2)
 
@@ -458,12 +462,12 @@ def test_a_large_effect_is_found_though_its_slope_at_null_points_elsewhere():
     asked = replace(problem({**TRUTH, "delay": 1.0}, 2), lanes=Lanes(Turning(), np.arange(4)))
     target, base = base_model(asked, 0)
     target = target.measured  # under whose noise so small a slope is seen
-    base = climb(target, base.x, base.free)
-    screen = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(base)
-    row = screen.row("lag")
+    base = optimise(target, base.x, base.free)
+    tests = ExtensionSearch(target, asked.candidates, asked.rules, 0).score_tests(base)
+    row = tests.row("lag")
     drop, start = lead(target, base, row.probe, row.lm)
     assert drop > 10.0 * row.lm
-    assert drop > 0.8 * screen.row("delay").lm  # of which it can do the same at its size 1 or -1
+    assert drop > 0.8 * tests.row("delay").lm  # of which it can do the same at its size 1 or -1
     assert abs(start[asked.coordinates.space.names.index("lag")]) == pytest.approx(1.0, abs=0.35)
 
 
@@ -480,8 +484,8 @@ def test_an_effect_is_found_between_a_point_that_does_nothing_and_one_that_does_
     asked = replace(problem({**TRUTH, "play": 0.4}, 2), lanes=Lanes(Stopping(), np.arange(4)))  # at 1.02 here
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen = search.screened(base)
-    row = screen.row("play")
+    tests = search.score_tests(base)
+    row = tests.row("play")
     drop, start = lead(target, base, row.probe, row.lm)
     index = asked.coordinates.space.names.index("play")
     assert start[index] == pytest.approx(1.02, abs=0.02)
@@ -494,16 +498,16 @@ def test_a_candidate_that_brings_nearly_as_much_is_named_beside_the_best():
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, replace(asked.rules, family=1.0), 0)
-    screen = search.screened(base)
+    tests = search.score_tests(base)
     brings = {"play": 20.0, "creep": 18.0, "wall": 16.0}
     fits = {name: replace(base, log_evidence=base.log_evidence + nats) for name, nats in brings.items()}
-    rows = tuple(screen.row(name) for name in brings)
-    step = search.best(screen, Refits(rows, {row.name: row.lm for row in rows}, fits, ()), further=False)
+    rows = tuple(tests.row(name) for name in brings)
+    step = search.best(tests, Refits(rows, {row.name: row.lm for row in rows}, fits, ()), further=False)
     assert (step.name, step.members) == ("play", ("play", "creep"))
 
 
 def test_a_rival_that_joins_the_model_later_is_no_rival_any_more():
-    rest = {"before": None, "fit": None, "log_bayes_factor": 5.0, "refits": {}, "judge": None}
+    rest = {"before": None, "fit": None, "log_bayes_factor": 5.0, "refits": {}, "fit_target": None}
     steps = [Added("play", ("play", "creep", "wall"), **rest), Added("creep", ("creep", "lag"), **rest)]
     assert [step.members for step in without_each_other(steps)] == [("play", "wall"), ("creep", "lag")]
 
@@ -513,20 +517,20 @@ def test_a_model_that_stopped_early_is_climbed_again_before_more_is_added_to_it(
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    screen = search.screened(base)
+    tests = search.score_tests(base)
     play, creep = (next(c for c in asked.candidates if c.name == name) for name in ("play", "creep"))
     with_play = np.array([*base.free, *play.indices], dtype=int)
-    early = climb(target, base.x, with_play, evaluations=0)
-    whole = climb(target, base.x, with_play)
+    early = optimise(target, base.x, with_play, evaluations=0)
+    whole = optimise(target, base.x, with_play)
     assert early.log_evidence < whole.log_evidence - 100.0  # what it is about
-    both = climb(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
+    both = optimise(target, whole.x, np.array([*with_play, *creep.indices], dtype=int))
     step = Added(
-        "creep", ("creep",), replace(screen, fit=early), both, both.log_evidence - early.log_evidence, {}, target
+        "creep", ("creep",), replace(tests, fit=early), both, both.log_evidence - early.log_evidence, {}, target
     )
-    again = climbed_again(search, step)
+    again = optimised_again(search, step)
     assert again is not None
     assert again.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
-    assert climbed_again(search, replace(step, before=replace(screen, fit=whole))) is None
+    assert optimised_again(search, replace(step, before=replace(tests, fit=whole))) is None
 
 
 def test_repeats_whose_clocks_differ_are_not_joined_and_named():
@@ -630,15 +634,15 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     asked = unrepeated({"play": 3.0}, 7)
     target, base = base_model(asked, asked.seed)
     search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
-    screen = search.screened(base)
+    tests = search.score_tests(base)
     useless, play = (next(c for c in asked.candidates if c.name == name) for name in ("creep", "play"))
-    first = climb(target, base.x, np.array([*base.free, *useless.indices]))
-    both = climb(target, first.x, np.array([*first.free, *play.indices]))
+    first = optimise(target, base.x, np.array([*base.free, *useless.indices]))
+    both = optimise(target, first.x, np.array([*first.free, *play.indices]))
     steps = [
-        Added("creep", ("creep",), screen, first, 0.0, {}, target),
-        Added("play", ("play",), screen, both, 9.0, {}, target),
+        Added("creep", ("creep",), tests, first, 0.0, {}, target),
+        Added("play", ("play",), tests, both, 9.0, {}, target),
     ]
-    named = Named(search, base, tuple(steps), screen)
+    named = Named(search, base, tuple(steps), tests)
     held_out = held_out_module._predicted(asked, named)
     assert held_out.supported() == 2
     assert not held_out.gain(0, 1).clear
@@ -647,7 +651,7 @@ def test_a_step_that_a_later_one_carries_is_not_adopted():
     assert set(kept.fit.free) == {*base.free, *play.indices}
     assert measured.gain(0, 1).clear
     # Where the first of the two is needed beside the second, both stay.
-    swapped = [replace(steps[0], name="play", fit=climb(target, base.x, np.array([*base.free, *play.indices])))]
+    swapped = [replace(steps[0], name="play", fit=optimise(target, base.x, np.array([*base.free, *play.indices])))]
     pair = [*swapped, replace(steps[1], name="creep")]
     always = replace(held_out, predictions=[held_out.predictions[k] for k in (0, 0, 2)])
     stayed, _ = held_out_module._without_carried(asked, named.extended(pair), always)
@@ -660,14 +664,14 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
     asked = unrepeated({"play": 3.0}, 7)
     target, base = base_model(asked, asked.seed)
     search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
-    screen = search.screened(base)
+    tests = search.score_tests(base)
     delay, play = (next(c for c in asked.candidates if c.name == name) for name in ("delay", "play"))
     order = {"delay": delay, "play": play}
     for first, second, left in (("delay", "play", ["play"]), ("play", "delay", ["play", "delay"])):
-        one = climb(target, base.x, np.array([*base.free, *order[first].indices]))
-        both = climb(target, one.x, np.array([*one.free, *order[second].indices]))
+        one = optimise(target, base.x, np.array([*base.free, *order[first].indices]))
+        both = optimise(target, one.x, np.array([*one.free, *order[second].indices]))
         fits = {first: one, second: both}
-        steps = [Added(name, (name,), screen, fit, 1.0, {}, target) for name, fit in fits.items()]
+        steps = [Added(name, (name,), tests, fit, 1.0, {}, target) for name, fit in fits.items()]
         kept = without_needless(search, base, steps)
         assert [step.name for step in kept] == left
         assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}

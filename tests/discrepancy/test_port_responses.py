@@ -16,9 +16,9 @@ from rfdropo_bayes.discrepancy.law_search import (
     TermGain,
     _pieces,
     _sums,
+    cross_validated_gains,
     fresh_terms,
     leading_terms,
-    left_out_gains,
 )
 from rfdropo_bayes.discrepancy.port_evidence import MEMORIES, SIZES, evidences
 from rfdropo_bayes.discrepancy.port_responses import Responses, feature_columns, on_splines, splines
@@ -102,11 +102,11 @@ def test_terms_of_null_data_pass_the_gate_as_seldom_as_is_said():
     values = np.stack([np.sin(k * time) for k in range(1, 30)])[None].repeat(GROUPS, axis=0)
     table = SimpleNamespace(features=[Feature("command", (k,)) for k in range(29)], of_motion=())
     search = LawSearch(found.ports, table, [], ((), "m"), 0, 0.1)
-    gate = search._gate(found, values, rng.normal(size=(199, GROUPS * VALUES)))
+    null_quantile = search._null_quantile(found, values, rng.normal(size=(199, GROUPS * VALUES)))
     small = 0
     for _ in range(60):
         drawn = replace(found, residual=rng.normal(size=(GROUPS, VALUES)))
-        small += bool(search._ranked(drawn, values, gate))
+        small += bool(search._ranked(drawn, values, null_quantile))
     assert 0 < small < 14
 
 
@@ -210,17 +210,17 @@ def test_gains_on_what_is_left_out_are_those_of_refits(groups, pull):
     time = STEP * np.arange(ROWS)
     features = np.stack([np.sin(8.0 * time), np.ones(ROWS)])[None, :, None].repeat(groups, axis=0)
     columns = feature_columns(found, PORTS[0], features)
-    gain, _, size, sd = left_out_gains(_sums(found, columns))
+    gain, _, size, sd = cross_validated_gains(_sums(found, columns))
     assert len(_pieces(found.residual)) == (PIECES if groups == 1 else groups)
     for k in range(2):
         assert gain[k, 0] == pytest.approx(brute(found, columns[:, :, k]), rel=1e-6)
     assert abs(size[0] - 0.3) < 4.0 * sd[0]
     null = np.random.default_rng(6).normal(size=(groups, VALUES, 2))
-    drawn = left_out_gains(_sums(found, columns, null))[0]
+    drawn = cross_validated_gains(_sums(found, columns, null))[0]
     assert np.allclose(drawn[:, 0], gain[:, 0])
     for draw in range(2):
         alone = replace(found, residual=null[:, :, draw], pull=None)
-        assert np.allclose(drawn[:, 1 + draw], left_out_gains(_sums(alone, columns))[0][:, 0])
+        assert np.allclose(drawn[:, 1 + draw], cross_validated_gains(_sums(alone, columns))[0][:, 0])
 
 
 def test_a_feature_gains_nothing_by_what_one_piece_alone_says_of_the_base_parameters():
@@ -235,7 +235,7 @@ def test_a_feature_gains_nothing_by_what_one_piece_alone_says_of_the_base_parame
     white = residual.reshape(-1) - found.base @ (found.base.T @ residual.reshape(-1))
     found = replace(found, residual=white.reshape(GROUPS, VALUES))
     features = np.stack([np.sin(k * time) for k in range(1, 60)])[None, :, None].repeat(GROUPS, axis=0)
-    gain, _, size, sd = left_out_gains(_sums(found, feature_columns(found, PORTS[0], features)))
+    gain, _, size, sd = cross_validated_gains(_sums(found, feature_columns(found, PORTS[0], features)))
     fitted = 0.5 * (size / sd) ** 2
     assert gain[:, 0].max() < fitted.max()
     assert np.all(gain[:, 0] < fitted + 0.5)

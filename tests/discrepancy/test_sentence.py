@@ -26,10 +26,10 @@ def answer() -> Answer:
     """Play, then creep, both adopted; the first of them given the lesser share, and a joint test that is not passed."""
     found = audit(problem({"gain": 1.3, "bend": -0.4, "play": 1.0, "creep": 0.6, "creep_time": 0.6}, 4))
     assert len(found.adopted) == 2
-    *before, last = found.causes.screens
-    screens = [*before, replace(last, omnibus=replace(last.omnibus, p=0.005))]
+    *before, last = found.causes.test_series
+    test_series = [*before, replace(last, omnibus=replace(last.omnibus, p=0.005))]
     validation = replace(found.validation, stages=[-0.01, 0.98])
-    causes = replace(found.causes, screens=screens)
+    causes = replace(found.causes, test_series=test_series)
     return replace(found, verdict="partly_explained", causes=causes, validation=validation)
 
 

@@ -9,7 +9,7 @@ from rfdropo_bayes.bayes.repeat_noise import repeat_shift
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.discrepancy.omnibus import statistics
 from rfdropo_bayes.discrepancy.score import project_out, span
-from rfdropo_bayes.discrepancy.screen import null_residuals, tail
+from rfdropo_bayes.discrepancy.score_tests import null_residuals, tail
 
 from .toys import measurements
 
@@ -95,7 +95,7 @@ def test_data_without_discrepancy_pass_whatever_their_markers_share(share):
     p = []
     for _ in range(60):
         measured = repeats(truth.draw(rng, shape))
-        noise = measured.noise(measured.spread, 0)
+        noise = measured.noise(measured.departures, 0)
         assert noise.first.correlation is not None
         base = span(measured.whiten(columns, noise).T)
         residual = project_out(base, measured.whiten(measured.channels[0].readings, noise)[:, None]).reshape(

@@ -13,7 +13,9 @@ LEFT = ("command_delay", "clock_offset", "actuator_lag")
 
 @pytest.mark.slow
 def test_a_delay_is_told_from_a_shift_of_the_clock():
-    """From no delay, a climb ends on a summit between two steps of the simulation, 7,000 nats below the right one."""
+    """From no delay, an optimisation ends at a maximum between two steps of the simulation, 7,000 nats below the right
+    one.
+    """
     arm = rb.Robot.outline(name="arm", length=0.25, radius=0.012, markers={"mid": 0.125, "tip": 0.25}, mass=0.09)
     late = rb.Model(arm, priors={"young_modulus": {}}, mechanisms=["command_delay"])
     walk = {"duration": 6.0, "interval": 0.3, "step": 0.004, "low": 0.0, "high": 0.014, "sample_time": 1.0 / 60.0}

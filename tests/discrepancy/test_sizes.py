@@ -12,7 +12,7 @@ import pytest
 from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.base_fit import base_model
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, climb, widened
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise, widened
 
 from .toys import WIDE, Toy, problem, with_prior
 
@@ -24,7 +24,7 @@ def with_delay(asked: AuditProblem) -> tuple[FitTarget, Fit, int]:
     target, base = base_model(asked, 0)
     target = target.measured
     index = asked.coordinates.names.index("delay")
-    return target, climb(target, base.x, np.array([*base.free, index])), index
+    return target, optimise(target, base.x, np.array([*base.free, index])), index
 
 
 def test_a_size_far_outside_its_prior_is_not_drawn_back_and_a_usual_one_is_left():
@@ -58,7 +58,7 @@ def test_a_wider_prior_leaves_a_ratio_that_motion_tells_however_curved_its_line_
     asked = problem({"gain": 1.3, "bend": 0.0, "delay": 40.0}, 3)
     target, mode, index = with_delay(replace(asked, lanes=Lanes(Ridge(), np.arange(4))))
     on_line = asked.coordinates.encode({"gain": 1.3, "bend": np.log(6.5 / 40.0), "delay": 6.5})
-    fit = climb(target, on_line, mode.free, evaluations=0)
+    fit = optimise(target, on_line, mode.free, evaluations=0)
     before = target.forward.rollouts
     found = widened(target, fit)
     assert target.forward.rollouts > before

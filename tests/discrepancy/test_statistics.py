@@ -42,7 +42,7 @@ from rfdropo_bayes.discrepancy.score import (
     span,
     statistic,
 )
-from rfdropo_bayes.discrepancy.screen import null_residuals, tail
+from rfdropo_bayes.discrepancy.score_tests import null_residuals, tail
 from rfdropo_bayes.discrepancy.verdict import decide
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 

@@ -11,9 +11,9 @@ import pytest
 from rfdropo_bayes.discrepancy import naming, repairs
 from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
-from rfdropo_bayes.discrepancy.fit import climb
+from rfdropo_bayes.discrepancy.fit import optimise
 from rfdropo_bayes.discrepancy.pipeline import audit
-from rfdropo_bayes.discrepancy.repairs import climbed_again
+from rfdropo_bayes.discrepancy.repairs import optimised_again
 
 from .toys import Geared, Opposed, problem_of
 
@@ -53,9 +53,9 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     not move show where they start: at the base model whose radius imitates the gains, which is as good as they are."""
     asked = problem_of(Geared(), {"radius": 1.0, **TRUTH}, 4, base=3)
     target, right = base_model(asked, 0)
-    screen = ExtensionSearch(target, asked.candidates, asked.rules, 0).screened(right)
+    tests = ExtensionSearch(target, asked.candidates, asked.rules, 0).score_tests(right)
     radius, *gains = (asked.coordinates.names.index(name) for name in ("radius", "gain_a", "gain_b"))
-    stuck = partial(climb, evaluations=0)
+    stuck = partial(optimise, evaluations=0)
     half = 0.5 * asked.coordinates.named(right.x)["radius"]
     halved, made_up = right.x.copy(), right.x.copy()
     halved[radius] = made_up[radius] = asked.coordinates.encode_one(radius, (half,))[0]
@@ -63,12 +63,12 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     stopped, extended = stuck(target, halved, right.free), stuck(target, made_up, np.array([*right.free, *gains]))
     gained = extended.log_evidence - stopped.log_evidence
     assert gained > 100.0
-    step = Added("cable_gains", ("cable_gains",), replace(screen, fit=stopped), extended, gained, {}, target)
-    monkeypatch.setattr(repairs, "climb", stuck)
+    step = Added("cable_gains", ("cable_gains",), replace(tests, fit=stopped), extended, gained, {}, target)
+    monkeypatch.setattr(repairs, "optimise", stuck)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    again = climbed_again(search, step)
+    again = optimised_again(search, step)
     assert again is not None
     assert again.x[radius] == pytest.approx(right.x[radius], rel=1e-3)
     assert again.log_evidence > extended.log_evidence
     # Where the base model is at its optimum, none is better.
-    assert climbed_again(search, replace(step, before=replace(screen, fit=right))) is None
+    assert optimised_again(search, replace(step, before=replace(tests, fit=right))) is None

@@ -207,7 +207,7 @@ def measurements(single: np.ndarray, members: tuple[tuple[int, ...], ...]) -> Me
 
 
 LANES = Lanes(Toy(), np.arange(4))
-START = {"gain": 1.0, "bend": 0.0}  # the toy is linear in both: one climb finds what a search finds in twenty
+START = {"gain": 1.0, "bend": 0.0}  # the toy is linear in both: one optimisation finds what a search finds in twenty
 COORDINATES: dict = {}  # whose priors are compiled once
 
 

@@ -30,7 +30,7 @@ OPTIONS = {
 CASES = [
     *OPTIONS.items(),
     ("laplace", {"starts": 4, "pilot_particles": 50, "rollouts": 2000.0, "draws": 50}),
-    ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem", "horizon": "linear"}),
+    ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem"}),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Figures and the verdict of a page: panels for narrow screens, no background, the answer first."""
+"""Figures and the verdict of a page: panels for narrow test_series, no background, the answer first."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ SHORT = [
 
 # The smallest settings that each method accepts and that bring it to its end.
 SETTINGS = {
-    "rfdropo": ["inference.rollouts=200", "inference.rollouts_per_candidate=4", "inference.finalists=2"],
+    "rfdropo": ["inference.rollouts=200", "inference.rollouts_per_candidate=4"],
     "smc": ["inference.rollouts=600", "inference.particles=50", "inference.blocks=2"],
     "laplace": ["inference.rollouts=300", "inference.starts=1", "inference.draws=40"],
     "nested": ["inference.live=20"],

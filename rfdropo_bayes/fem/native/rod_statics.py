@@ -193,7 +193,7 @@ def _iterate(tables, runs, samples, factors, work, friction, rows, p, slips, bou
 
 @kernel
 def _set_least(tables, samples, work, token):
-    """Least share of the mass in the matrix, about the square of the first frequency [1/s2]."""
+    """Smallest factor on the mass in the matrix, about the square of the first natural frequency [1/s2]."""
     one, flexible, mass = fill(1.0, work.frame, token), fill(0.0, work.frame, token), fill(TINY, work.frame, token)
     for element in range(tables.stations - 1):
         flexible = flexible + one / load(samples.section, SECTION * element + 3, token)

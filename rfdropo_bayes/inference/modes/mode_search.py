@@ -51,7 +51,6 @@ from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc.moves import BlockProblem, StraightProblem, squared_distance
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES
 
-JACOBIANS = ("auto", "forward", "central")
 SAME = 0.02  # largest difference of any coordinate between two optimisations with the same result
 ALTERNATIVE = 30.0  # nats below the best optimum, beyond which another matters to no posterior: exp(-30) is 1e-13
 PILOT_SHARE = 0.6  # share of the budget of optimisations that a pilot run may take, and of their progress
@@ -74,7 +73,6 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
         blocks: number of horizons of an optimisation or of the pilot run, doubling; two follow a pilot run.
         max_steps: most steps of an optimisation at one horizon.
         tolerance: predicted gain of a step below which an optimisation ends [nat].
-        jacobian: "forward", "central" or "auto".
         draws: draws from the normal approximations, weighted by the exact posterior and resampled.
         rollouts: budget in full-length rollouts, shared by the optimisations, with at most `PILOT_SHARE` for a
             pilot run; the rest, at least a quarter, weights the draws. None for no limit.
@@ -86,7 +84,6 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
     blocks: int = 3
     max_steps: int = 60
     tolerance: float = 1e-4
-    jacobian: str = "auto"
     draws: int = 2000
     rollouts: float | None = None
 
@@ -101,10 +98,6 @@ class LaplaceConfig(MethodOptions, called="Laplace"):
             )
         if self.tolerance <= 0.0 or (self.rollouts is not None and self.rollouts <= 0.0):
             raise InputError("tolerance and rollouts must be positive", where="[inference]")
-        if self.jacobian not in JACOBIANS:
-            raise InputError(
-                f"unknown jacobian {self.jacobian!r}", where="[inference]", remedy=f"use one of {', '.join(JACOBIANS)}"
-            )
 
 
 class Optimisations(NamedTuple):
@@ -454,7 +447,7 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
     prior = prior_derivatives(problem)
 
     def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Optimisable:
-        return make_target(problem, horizon, ledger, u, prior, config.jacobian, noise)
+        return make_target(problem, horizon, ledger, u, prior, noise)
 
     return block_boundaries(problem.n_rows, PILOT_PREFIXES if config.pilot_particles else config.blocks), by_residuals
 
@@ -639,7 +632,7 @@ def _counted(problem: Problem, optima: Modes, config: LaplaceConfig) -> tuple[Pr
     def target_of(problem: CountedProblem) -> Target:
         derivatives = prior_derivatives(problem)
         at, noise = modes[0].mean, search.noise
-        return make_target(problem, problem.n_rows, search.ledger, at, derivatives, config.jacobian, noise)
+        return make_target(problem, problem.n_rows, search.ledger, at, derivatives, noise)
 
     lasting = lasting_residuals(problem, target_of(problem), modes[0])
     shares = {name: each.share for name, each in lasting.items() if each.share < 1.0}

@@ -97,7 +97,6 @@ def make_target(
     ledger: Ledger,
     u: Float[np.ndarray, " d"],
     prior: tuple[Callable, Callable],
-    jacobian: str = "auto",
     noise: Bool[np.ndarray, " d"] | None = None,
 ) -> Target:
     """Posterior of the first ``horizon`` rows.
@@ -108,7 +107,6 @@ def make_target(
         ledger: charged with every rollout; a Jacobian in d directions counts as d + 1.
         u: a point with a finite likelihood, at which noise coordinates are identified.
         prior: `prior_derivatives`.
-        jacobian: "forward" (JAX), "central" differences, or "auto": forward if residuals can be traced.
         noise: noise coordinates, if known.
     """
 
@@ -118,7 +116,7 @@ def make_target(
     def density(points: np.ndarray) -> np.ndarray:
         return evaluate_prior(problem, points) + likelihood(points)
 
-    residuals_at, linearise, differences = _make_linearise(problem, horizon, ledger, u, jacobian)
+    residuals_at, linearise, differences = _make_linearise(problem, horizon, ledger, u)
     if noise is None and len(problem.physical_names) < len(problem.names):
         noise = np.array([name not in problem.physical_names for name in problem.names])
     if noise is None:
@@ -141,7 +139,7 @@ def prior_derivatives(problem: ResidualProblem) -> tuple[Callable, Callable]:
 
 
 def _make_linearise(
-    problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray, jacobian: str
+    problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray
 ) -> tuple[Callable, Callable, Callable | None]:
     """Three functions: residuals of a batch of points, without a charge to the budget; residuals and Jacobian at one
     point, with a charge; and `Target.differences`."""
@@ -150,8 +148,7 @@ def _make_linearise(
         values = problem.from_unconstrained(u[None])
         return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
 
-    if jacobian == "auto":
-        jacobian = problem.jacobian
+    jacobian = problem.jacobian
     in_batches = problem.residual_batch if jacobian == "central" and isinstance(problem, BatchedResiduals) else None
     width = BATCH_DIFFERENCE if in_batches else DIFFERENCE
     batched = None

@@ -31,12 +31,12 @@ from rfdropo_bayes.inference.rfdropo.phi_space import WIDTH, search_space
 from rfdropo_bayes.inference.smc.moves import host_generator
 
 OPTIMISERS = ("cma", "cem")
-HORIZONS = ("paper", "linear", "full")
 STEP = 0.3  # initial step of an optimiser, as a share of the search range
 LEVELS = 8  # rollouts are simulated to one of this many horizons, the shortest sufficient horizon
 # Added to the variances, in squared units of the trajectory's root mean square motion; unless the published pipeline is
 # asked for, the observation noise at the prior's medians is also added.
 FLOOR = 1e-5
+FINALISTS = 10  # number of candidates scored again at the full horizon
 FINAL = 10**6  # key of the finalists' random numbers, beyond any generation's
 DRAWS = FINAL + 1
 
@@ -50,8 +50,6 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         evaluations: number of candidates if there is no budget (paper: 5000).
         rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
         optimiser: "cma" or "cem".
-        horizon: schedule "paper", "linear" or "full".
-        finalists: number of candidates scored again at the full horizon.
         parameters: names of the searched parameters; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
         draws: number of draws of the final distribution.
@@ -63,8 +61,6 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
     evaluations: int = 5000
     rollouts_per_candidate: int = 100
     optimiser: str = "cma"
-    horizon: str = "paper"
-    finalists: int = 10
     parameters: tuple[str, ...] = ()
     search: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     draws: int = 2000
@@ -74,9 +70,7 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         where = "[inference]"
         if self.optimiser not in OPTIMISERS:
             raise InputError(f"unknown optimiser {self.optimiser!r}", where=where, remedy=f"use one of {OPTIMISERS}")
-        if self.horizon not in HORIZONS:
-            raise InputError(f"unknown horizon {self.horizon!r}", where=where, remedy=f"use one of {HORIZONS}")
-        least = {"evaluations": 1, "rollouts_per_candidate": 4, "finalists": 1, "draws": 1}
+        least = {"evaluations": 1, "rollouts_per_candidate": 4, "draws": 1}
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
                 raise InputError(f"{name} = {getattr(self, name)} is less than {lowest}", where=where)
@@ -105,24 +99,16 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     population = default_population(config.optimiser, space.dimension)
     fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
     scale = motion_scale(np.asarray(problem.observed, dtype=float), np.asarray(problem.observed_mask))
-    finalists = config.finalists if config.mended else 0
+    finalists = FINALISTS if config.mended else 0
     generations = max(1, config.evaluations // population)
     if config.rollouts is not None:
         generations = _affordable_generations(problem.n_rows, population, finalists, config)
-    horizons = _horizons(generations, problem.n_rows, config)
+    horizons = tuple(paper_horizon(i, generations, problem.n_rows, mended=config.mended) for i in range(generations))
     floor = np.full(np.asarray(problem.observed_mask).shape[1], FLOOR)
     if config.mended:
         middle = {name: float(np.median(values)) for name, values in prior.items()}
         floor = floor + (np.asarray(problem.noise_deviation(middle), dtype=float) / scale) ** 2
     return ScorePlan(space, population, horizons, min(finalists, generations + 1), fixed, scale, floor)
-
-
-def _horizons(generations: int, n_rows: int, config: RfdropoConfig) -> tuple[int, ...]:
-    if config.horizon == "full":
-        return (n_rows,) * generations
-    if config.horizon == "linear":
-        return tuple(linear_horizon(i, generations, n_rows) for i in range(generations))
-    return tuple(paper_horizon(i, generations, n_rows, mended=config.mended) for i in range(generations))
 
 
 def _simulated(horizon: int, n_rows: int) -> int:
@@ -137,7 +123,7 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
     budget = config.rollouts / config.rollouts_per_candidate - finalists
 
     def cost(generations: int) -> float:
-        taus = _horizons(generations, n_rows, config)
+        taus = (paper_horizon(i, generations, n_rows, mended=config.mended) for i in range(generations))
         return population * sum(_simulated(tau, n_rows) for tau in taus) / n_rows
 
     if cost(1) > budget:
@@ -145,7 +131,7 @@ def _affordable_generations(n_rows: int, population: int, finalists: int, config
         raise InputError(
             f"{config.rollouts:g} rollouts do not allow one generation of {population} candidates",
             where="[inference] rollouts",
-            remedy=f"allow at least {least:.0f}, or fewer rollouts_per_candidate or finalists",
+            remedy=f"allow at least {least:.0f}, or fewer rollouts_per_candidate",
         )
     low, high = 1, 2
     while cost(high) <= budget:
@@ -306,11 +292,6 @@ def paper_horizon(iteration: int, iterations: int, n_rows: int, *, mended: bool 
     last = max(iterations - 1, 1)
     share = (1.0 - 10.0 ** (-2.0 * min(iteration / last, 1.0))) / 0.99
     return min(n_rows, max(1, math.floor(n_rows * share + 1e-9)))
-
-
-def linear_horizon(iteration: int, iterations: int, n_rows: int) -> int:
-    """Horizon that grows evenly from 1 and is ``n_rows`` at the last iteration, ``iterations - 1``."""
-    return min(n_rows, max(1, math.ceil(n_rows * (iteration + 1) / iterations)))
 
 
 def default_population(name: str, d: int) -> int:

@@ -297,7 +297,7 @@ def prefix_evidence(
         return []
     prior, start, estimates = prior_derivatives(problem), mode.mean, []
     for horizon in sorted(horizons, reverse=True):
-        target = make_target(problem, horizon, ledger, start, prior, "auto", noise)
+        target = make_target(problem, horizon, ledger, start, prior, noise)
         state, _ = maximise(target, start, max_steps=steps, tolerance=1e-2)
         start = state.position
         mixture = ModeMixture(problem, [laplace(target, state)], INFLATION, DEGREES, PRIOR_SHARE)

@@ -27,7 +27,7 @@ DIRECTED = "candidates"
 
 
 @dataclass(frozen=True)
-class ScreenRow:
+class ScoreRow:
     """Score test of one candidate.
 
     Attributes:
@@ -49,7 +49,7 @@ class ScreenRow:
 
 
 @dataclass(frozen=True)
-class Screen:
+class ScoreTests:
     """A model, the joint test of its residuals, and the score tests of candidates (best first).
 
     ``finer`` is the joint test of the residuals on a finer mesh and time step, None without it; ``omnibus`` is the same
@@ -58,7 +58,7 @@ class Screen:
 
     fit: Fit
     omnibus: Omnibus
-    rows: tuple[ScreenRow, ...]
+    rows: tuple[ScoreRow, ...]
     finer: Omnibus | None = None
 
     @property
@@ -66,12 +66,12 @@ class Screen:
         """Whether it is on the finer mesh and time step that the model was tested."""
         return self.omnibus is self.finer
 
-    def row(self, name: str) -> ScreenRow:
+    def row(self, name: str) -> ScoreRow:
         """Row of one candidate."""
         return next(row for row in self.rows if row.name == name)
 
 
-def screen(
+def run_score_tests(
     target: FitTarget,
     fit: Fit,
     probes: Sequence[Probe],
@@ -79,7 +79,7 @@ def screen(
     seed: Any,
     bootstraps: int,
     finer: Float[np.ndarray, " n"] | None = None,
-) -> Screen:
+) -> ScoreTests:
     """Test a fitted model and candidates against it, calibrated by parametric bootstrap.
 
     Args:
@@ -94,8 +94,8 @@ def screen(
     seen = [probe for probe in probes if probe.mark.rank > 0]
     # As in the simulated data sets, a further step of the parameters is no discrepancy: a prior holds back a size of
     # many of its deviations.
-    left = np.stack([fit.residual] if finer is None else [fit.residual, finer])
-    residuals = project_out(span(fit.jacobian), left.T).T
+    measured = np.stack([fit.residual] if finer is None else [fit.residual, finer])
+    residuals = project_out(span(fit.jacobian), measured.T).T
     observed, surprises = _statistics(target, residuals, seen)
     simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
     if target.noise.source == RESIDUALS:  # their mean square equals the residuals' by construction
@@ -109,18 +109,20 @@ def screen(
         blocks = block_squares(white, target.measurements.valid)
         tests.append(joint_test({name: float(v[index]) for name, v in observed.items()}, simulated, blocks))
     rows = [_row(name, seen, surprises[0], most, fit) for name in names]
-    return Screen(fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None)
+    return ScoreTests(
+        fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None
+    )
 
 
-def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> ScreenRow:
+def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> ScoreRow:
     own = [i for i, probe in enumerate(seen) if probe.candidate == name]
     if not own:
-        return ScreenRow(name, None, 0.0, 0, 1.0, 1.0, -np.inf)
+        return ScoreRow(name, None, 0.0, 0, 1.0, 1.0, -np.inf)
     best = max(own, key=lambda i: surprises[i])
     probe = seen[best]
     lm = float(statistic(probe.mark, fit.residual)[0])
     score = lm - probe.mark.rank * np.log(fit.counted)
-    return ScreenRow(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
+    return ScoreRow(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
 
 
 def _p_value(surprise: float) -> float:
@@ -131,9 +133,9 @@ def _p_value(surprise: float) -> float:
 def _statistics(
     target: FitTarget, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe]
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "count probe"]]:
-    found = statistics(target.measurements.series(residuals))
+    joint = statistics(target.measurements.series(residuals))
     surprises = [statistic(probe.mark, residuals)[1] for probe in probes]
-    return found, np.stack(surprises, axis=1) if probes else np.zeros((len(residuals), 0))
+    return joint, np.stack(surprises, axis=1) if probes else np.zeros((len(residuals), 0))
 
 
 def _simulated(
@@ -168,18 +170,18 @@ def null_residuals(
         rng: random generator of the noise.
         count: number of data sets.
     """
-    found = np.empty((count, len(base)))
-    drawn = noise.at(measurements.single_steps).draw(rng, (count, *measurements.spread.shape))
+    residuals = np.empty((count, len(base)))
+    drawn = noise.at(measurements.single_steps).draw(rng, (count, *measurements.departures.shape))
     if noise.source == RESIDUALS:
         drawn = _fitted(measurements, noise, base, drawn)
     for row, single in enumerate(drawn):
         estimated = noise
         if noise.source not in (STATED, MISFIT):
             estimated = measurements.noise(single, parameters, noise)
-        found[row, : measurements.count.size] = measurements.whiten(measurements.mean_of(single), estimated)
+        residuals[row, : measurements.count.size] = measurements.whiten(measurements.mean_of(single), estimated)
     weighed = measurements.size - measurements.count.size  # whose errors are known
-    found[:, measurements.count.size :] = rng.standard_normal((count, weighed))
-    return project_out(base, found.T).T
+    residuals[:, measurements.count.size :] = rng.standard_normal((count, weighed))
+    return project_out(base, residuals.T).T
 
 
 def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
@@ -189,9 +191,9 @@ def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn:
     order = [group[0] for group in measurements.members]
     white = measurements.whiten(drawn[:, order], noise)
     rows = base[: measurements.count.size]
-    left = (white - white @ rows @ rows.T).reshape(len(drawn), *measurements.count.shape)
+    residuals = (white - white @ rows @ rows.T).reshape(len(drawn), *measurements.count.shape)
     fitted = np.empty_like(drawn)
-    fitted[:, order] = noise.at(measurements.steps).colour(left, measurements.valid)
+    fitted[:, order] = noise.at(measurements.steps).colour(residuals, measurements.valid)
     return fitted
 
 
