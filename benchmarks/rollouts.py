@@ -2,7 +2,7 @@
 
     python benchmarks/rollouts.py [--push] [--json FILE] [--mesh FILE] [--seconds S] [--batch N]
 
-The bar has 20 layers of 4 nodes and 8 cables; it is timed at the engine. The trunk is timed as inference calls it,
+The bar has 20 elements and 8 cables; it is timed at the engine. The trunk is timed as inference calls it,
 through commands, limits and markers. Parameters differ from rollout to rollout. Compilation is not counted; the best of
 the repeats is. The JAX engine uses as many processors as XLA likes; the Numba engine is timed on one thread and on all.
 Rates of one thread are those of processor time, others of the clock on the wall.

@@ -83,7 +83,11 @@ def forced_search(model: rb.Model, seed: int, workshop: Workshop) -> dict[str, A
     search = law_search(target, problem.ports, channels, unit, seed, problem.rules.family, lambda line: None)
     found = search.find(target, base, forced=True)
     terms = [[refit.term.port.name, refit.term.feature.formula(channels), refit.score] for refit in found.terms]
-    numbers = {"port_p": found.ports[0].adjusted_p, "null_quantile_nats": found.gate, "offered_nats": found.offered}
+    numbers = {
+        "port_p": found.ports[0].adjusted_p,
+        "null_quantile_nats": found.null_quantile,
+        "offered_nats": found.offered,
+    }
     seconds = round(time.process_time() - began, 1)
     return {"verdict": "a law" if terms else "no law", **numbers, "terms": terms, "cpu_seconds": seconds}
 

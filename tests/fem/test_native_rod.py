@@ -113,6 +113,33 @@ def test_an_end_load_bends_a_cantilever_as_bisshopp_and_drucker_found():
     assert 1.0 - tip[2] / LENGTH == pytest.approx(0.16064, rel=4e-3)
 
 
+@pytest.mark.slow
+def test_a_bar_sags_as_a_chain_of_mujoco():
+    """Fifty rigid links with springs of E I between them, half a link at both ends, under their own weight: a tip that
+    hangs down by two thirds of the length is where ours is, within 1 %."""
+    mujoco = pytest.importorskip("mujoco")
+    links, spring = 50, STIFFNESS * 50 / LENGTH
+    link, bodies = LENGTH / links, ""
+    for number in range(links):
+        half = link / 4.0 if number == links - 1 else link / 2.0
+        bodies += f"""<body pos="{link if number else link / 2.0} 0 0">
+            <joint type="hinge" axis="0 1 0" stiffness="{spring}" damping="{0.03 * spring}"/>
+            <geom type="box" pos="{half} 0 0" size="{half} {HALF} {HALF}" density="{DENSITY}" contype="0"/>"""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.005" gravity="0 0 -9.81" integrator="implicitfast"/>
+        <worldbody>{bodies}{"</body>" * links}</worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    for _ in range(1600):
+        mujoco.mj_step(model, data)
+    theirs = data.xpos[-1] + data.xmat[-1].reshape(3, 3)[:, 0] * link / 2.0
+    rest = NativeRod(*bar(), TIME_STEP, threads=1, integrator="quasi-static")
+    found = rest.rollout(bar_material(density=DENSITY, gravity=np.array([-9.81, 0.0, 0.0])), np.zeros((1, 1, 0)))
+    x, _, z = found.position[0, -1, 0]
+    assert found.converged.all()
+    np.testing.assert_allclose([z, 0.0, x], theirs, atol=0.01 * LENGTH)
+
+
 def test_a_bar_swings_at_its_first_frequency():
     """1.8751^2 sqrt(E I / rho A L^4), of a bar that is let go; shear and rotary inertia take less than 1 %."""
     system, points = bar()

@@ -150,4 +150,4 @@ def test_commands_that_never_move_leave_the_arrangement_as_it_is():
     still = Rows(np.full((20, 3), 0.001), own.markers(np.full((20, 3), 0.001))[0], np.arange(20.0))
     found = find_arrangement(own, still)
     assert found.arrangement == as_written(3, 1)
-    assert found.rivals == ()
+    assert found.alternatives == ()

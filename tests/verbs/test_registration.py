@@ -27,9 +27,11 @@ def test_a_rigid_motion_of_points_is_found_exactly(seed, scaled):
     np.testing.assert_allclose(found.shift, shift, atol=1e-9)
     assert found.scale == pytest.approx(scale)
     assert found.explained == pytest.approx(1.0)
-    rest = Rotation.from_rotvec(found.left_over).as_matrix()
+    rest = Rotation.from_rotvec(found.remaining_turn).as_matrix()
     np.testing.assert_allclose(found.quarter @ rest, rotation, atol=1e-9)
-    assert np.linalg.norm(found.left_over) < np.radians(63.0)  # the largest angle to the nearest of the 24 rotations
+    assert np.linalg.norm(found.remaining_turn) < np.radians(
+        63.0
+    )  # the largest angle to the nearest of the 24 rotations
 
 
 def test_a_mirror_image_is_not_explained():
