@@ -66,7 +66,7 @@ def evaluate(
     Args:
         model: simulated model.
         options: keys of [training], such as the task. Without that table the settings of the first policy's training
-        are used.
+            are used.
         fit: a calibration, or its folder, whose posterior provides the episodes' parameters.
         policies: policy.onnx, or folders that hold one; named after their folders, with parent folders if two names are
             equal.
