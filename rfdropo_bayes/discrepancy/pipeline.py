@@ -306,7 +306,7 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
     # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that
     # passes the joint test leaves nothing to describe, even if the explained fraction is uncertain.
     if verdict == UNEXPLAINED or (verdict == PARTLY and not passes) or (verdict == NO_VERDICT and not base.converged):
-        # Also beside mechanisms that unseen recordings do not support: they make a law visible, which then replaces them.
+        # Mechanisms that unseen recordings do not support may make a law visible, which then replaces them.
         for described in describe(problem, last, kept.held_out, report):
             results = replace(results, described=described)
             yield results
