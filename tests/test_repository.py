@@ -45,6 +45,17 @@ def constraints() -> dict[str, str]:
     return {canonicalize_name(name): version for name, version in pairs}
 
 
+def test_every_fault_of_the_mutants_can_be_put_in() -> None:
+    """The text of a fault stands once in its file, and its tests are there: a renamed variable would hide it."""
+    faults = tomllib.loads((REPOSITORY / "tools" / "mutants.toml").read_text())["fault"]
+    assert faults
+    for fault in faults:
+        assert (REPOSITORY / "rfdropo_bayes" / fault["file"]).read_text().count(fault["old"]) == 1, fault
+        for test in fault["tests"]:
+            path, _, name = test.partition("::")
+            assert f"def {name.partition('[')[0]}" in (REPOSITORY / path).read_text(), test
+
+
 def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z][a-z-]*):", (REPOSITORY / "Makefile").read_text(), flags=re.MULTILINE))
 

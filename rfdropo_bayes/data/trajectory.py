@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from rfdropo_bayes.data import checks, in_memory
 from rfdropo_bayes.data.faults import NOTES
 from rfdropo_bayes.data.first_command import begun_from
-from rfdropo_bayes.data.named_columns import CsvColumns
+from rfdropo_bayes.data.named_columns import UNTIMED, CsvColumns
 from rfdropo_bayes.data.recorded import (
     FIRST_COMMAND,
     MISSING,
@@ -253,6 +253,11 @@ class Trajectory:
     def notes(self) -> list[str]:
         """The importer's notes on valid but suspicious rows of the file, each with a remedy."""
         return list(self.settings.get(NOTES, ()))
+
+    @property
+    def timed(self) -> bool:
+        """Whether rows have times of their own; without them one a second is assumed."""
+        return UNTIMED not in self.notes
 
     @property
     def missing(self) -> str:

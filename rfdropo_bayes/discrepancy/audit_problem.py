@@ -10,7 +10,6 @@ from rfdropo_bayes.bayes.lanes import Lanes
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.named_columns import UNTIMED
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
@@ -63,7 +62,7 @@ class AuditProblem:
     @property
     def timed(self) -> bool:
         """Whether rows have times."""
-        return all(UNTIMED not in trajectory.notes for trajectory in self.trajectories)
+        return all(trajectory.timed for trajectory in self.trajectories)
 
     def candidate(self, name: str) -> Candidate | None:
         """A candidate by its name; None for the mesh and time step, which are not in the library."""

@@ -32,7 +32,6 @@ from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.inference import LaplaceConfig, find_modes, maximise, normal_at, optimisation_cost
 from rfdropo_bayes.inference import Target as Climbed
-from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
@@ -505,7 +504,7 @@ def base_optimum(target: FitTarget, key: PRNGKeyArray) -> Float[np.ndarray, " d"
 
 def _searching(target: FitTarget) -> LaplaceConfig:
     """Search settings of `calibrate`; rows of a body at rest are independent, and have one horizon."""
-    rests = getattr(target.forward.lanes.simulator, "integrator", None) == QUASI_STATIC
+    rests = getattr(target.forward.lanes.simulator, "at_rest", False)
     return LaplaceConfig(tolerance=OPTIMISED, blocks=1) if rests else LaplaceConfig(tolerance=OPTIMISED)
 
 

@@ -143,10 +143,8 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[FittedM
         which, unseen, predictions = _left_out(problem, fit_targets, target, fits)
     stages, fit_targets = stages[: len(predictions)], fit_targets[: len(predictions)]
     patterns = [target.measurements.series(as_measured(fit_target, fit).residual) for fit_target, fit, _ in stages]
-    deviations, noises = (
-        [residual_deviation(fit_target, fit) for fit_target, fit, _ in stages],
-        [each.noise for each in fit_targets],
-    )
+    deviations = [residual_deviation(fit_target, fit) for fit_target, fit, _ in stages]
+    noises = [fit_target.noise for fit_target in fit_targets]
     return HeldOut(which, unseen, predictions, patterns, target.noise, noises, deviations, problem.seed)
 
 
@@ -180,7 +178,7 @@ def _left_out(
         held_out = "fitted recordings, each left out in turn"
         masks = [np.arange(groups)[:, None, None] == g for g in range(groups)]
     elif getattr(target.forward.lanes.simulator, "at_rest", False):
-        held_out = f"poses, each block of a {BLOCKS}th left out in turn"
+        held_out = f"{BLOCKS} blocks of poses, each left out in turn"
         masks = [block[:, :, None] for block in blocks_of_rows(measured.valid)]
     else:
         held_out = "the later rows of the only recording" if groups == 1 else "the later rows of the fitted recordings"

@@ -20,7 +20,6 @@ from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.named_columns import UNTIMED
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.candidates import Candidate
@@ -277,7 +276,7 @@ def build_problem(
 def _ports(simulator: AnySimulator, model: TrajectoryModel, fitted: Sequence[Trajectory]) -> PortMap:
     """Ports of a simulator; without delays if rows have no times."""
     ports = port_map(simulator, model.recordings.markers)
-    if all(UNTIMED not in trajectory.notes for trajectory in fitted):
+    if all(trajectory.timed for trajectory in fitted):
         return ports
     return ports._replace(ports=tuple(port for port in ports.ports if port.unit != "s"))
 
@@ -358,8 +357,7 @@ def obstacles(spec: ModelSpec, names: Sequence[str], recording: Trajectory) -> d
         (mechanism,) = mechanisms_named([name], spec.robot, folder=spec.folder, where="[audit] candidates")
         body = BLACK_BOX if isinstance(spec.robot, BlackBox) else spec.simulator.body
         cables = not isinstance(spec.robot, Robot) or bool(spec.robot.cables)
-        timed = UNTIMED not in recording.notes
-        why = obstacle(mechanism, body, engine, spec.simulator.motion, cables=cables, timed=timed)
+        why = obstacle(mechanism, body, engine, spec.simulator.motion, cables=cables, timed=recording.timed)
         if why is None and name not in REGISTRY:
             why = _refusal(build_simulator(spec.with_mechanisms(name)), commands)
         if why is not None:

@@ -11,7 +11,6 @@ from jaxtyping import Float
 
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.data import Trajectory, shared_markers
-from rfdropo_bayes.data.named_columns import UNTIMED
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.integrators import STAGES
 from rfdropo_bayes.model.assembly import build_robot_simulator, physical_values
@@ -75,8 +74,12 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
         finer = _distance(here, moved(time_step=simulator.time_step / FINER))
     if simulator.engine.is_rod:
         elements = _distance(here, moved(refine=MORE_ELEMENTS * table.refine))
-    timed = UNTIMED not in recording.notes  # rows without times have no speed
-    if timed and simulator.engine.carries_loads and all(QUASI_STATIC in motions_of(m) for m in simulator.mechanisms):
+    # Rows without times have no speed.
+    if (
+        recording.timed
+        and simulator.engine.carries_loads
+        and all(QUASI_STATIC in motions_of(m) for m in simulator.mechanisms)
+    ):
         other = {"motion": "dynamic"} if simulator.at_rest else {"motion": QUASI_STATIC, **dict.fromkeys(MOVING)}
         dynamic = replace(spec, simulator=table.model_copy(update={"motion": "dynamic"}))
         moving = build_robot_simulator(dynamic) if simulator.at_rest else simulator
