@@ -120,8 +120,8 @@ def source_of(mechanism: Any) -> str:
     """Name of a mechanism in a file: a name of the library, or ``module:ClassName``."""
     if isinstance(mechanism, str):
         return mechanism
-    kind = mechanism if isinstance(mechanism, type) else type(mechanism)
-    return f"{kind.__module__}:{kind.__qualname__}"
+    kind: Any = mechanism if isinstance(mechanism, type) else type(mechanism)
+    return kind.name if REGISTRY.get(kind.name) is kind else f"{kind.__module__}:{kind.__qualname__}"
 
 
 def _imported(name: str, folder: Path, where: str) -> Any:

@@ -12,6 +12,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.mechanisms.registry import choose_mechanisms
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
@@ -289,3 +290,12 @@ def test_a_drift_of_a_camera_is_the_mechanism_with_the_size_of_each_row():
     drifted = applied("camera_scale_drift", {"camera_scale_error_rate": jnp.asarray(0.01)})
     elapsed = (TIME - TIME[0])[:, None, None]
     np.testing.assert_allclose(drifted, (1.0 + 0.01 * elapsed) * POSITION, rtol=1e-12)
+
+
+def test_a_class_of_the_library_is_named_as_in_a_file():
+    """Drifts are made by a function: their classes cannot be imported by module and name."""
+    for name, kind in REGISTRY.items():
+        (choice,) = choose_mechanisms([kind])
+        assert choice.source == name
+        (again,) = choose_mechanisms([choice.source])
+        assert again.kind is kind
