@@ -120,8 +120,9 @@ def source_of(mechanism: Any) -> str:
     """Name of a mechanism in a file: a name of the library, or ``module:ClassName``."""
     if isinstance(mechanism, str):
         return mechanism
-    kind: Any = mechanism if isinstance(mechanism, type) else type(mechanism)
-    return kind.name if REGISTRY.get(kind.name) is kind else f"{kind.__module__}:{kind.__qualname__}"
+    kind = mechanism if isinstance(mechanism, type) else type(mechanism)
+    name = str(getattr(kind, "name", ""))  # a user's class without a name is refused where it is made
+    return name if REGISTRY.get(name) is kind else f"{kind.__module__}:{kind.__qualname__}"
 
 
 def _imported(name: str, folder: Path, where: str) -> Any:

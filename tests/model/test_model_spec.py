@@ -53,7 +53,7 @@ def test_mechanisms_and_robots_made_in_python_stay_the_objects_that_they_are():
     model = rb.Model(robot, mechanisms=[lost]).with_mechanisms("command_delay")
     assert model.robot is robot
     assert model.spec.mechanisms[0].made_for(robot) is lost
-    assert model.spec.sources == ("rfdropo_bayes.mechanisms.actuation:Backlash", "command_delay")
+    assert model.spec.sources == ("backlash", "command_delay")
     assert model.tables()["robot"] == "robot.toml"
 
 
