@@ -4,10 +4,10 @@
     python benchmarks/leave_out.py --store FOLDER
 
 The settings name experiments, patterns of recordings that are left out together, such as those of a day, and the
-seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also if the experiment fits
-some rows of them; after an adaptation the first one as far as it was not shown. Optimisations start from the prior, or from
-the optimum of `start`, the folder of a calibration: a day that is left out has chosen the basin then, and nothing else.
-`set` changes entries of the experiment, as ``--set`` does.
+seconds of the first of them that each fit is then adapted to. Recordings are predicted whole, also if the experiment
+fits some rows of them; after an adaptation the first one as far as it was not shown. Optimisations start from the
+prior, or from the optimum of `start`, the folder of a calibration: a day that is left out has chosen the basin then,
+and nothing else. `set` changes entries of the experiment, as ``--set`` does.
 
 Every line of DIR/ledger.jsonl has the figures of a day: how far the last marker is off [mm], before an adaptation (from
 the first row, in the same rows) and after it, and the share of the measured coordinates lies in the 90 % bands: of
