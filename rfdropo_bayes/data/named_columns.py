@@ -29,7 +29,7 @@ from rfdropo_bayes.data.sample_times import TimeUnit, rounded_notes
 from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 PASCALS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "mbar": 1e2, "bar": 1e5, "psi": 6894.757293168}
 COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
@@ -41,7 +41,25 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
 }
 COUNTS = "counts"  # encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known
 CommandUnit = Literal[
-    "m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "MPa", "mbar", "bar", "psi", "V", "A", "%", "-"
+    "m",
+    "cm",
+    "mm",
+    "in",
+    "rad",
+    "deg",
+    "counts",
+    "N",
+    "N m",
+    "Pa",
+    "kPa",
+    "MPa",
+    "mbar",
+    "bar",
+    "psi",
+    "V",
+    "A",
+    "%",
+    "-",
 ]
 
 
@@ -134,7 +152,7 @@ class CsvColumns(BaseModel):
     positions: list[tuple[str, str, str]] = Field(
         min_length=1, description="columns of x, y and z of each marker, base to tip"
     )
-    position_unit: Literal["m", "cm", "mm"] = Field(
+    position_unit: Literal["m", "cm", "mm", "in"] = Field(
         description='unit of the positions; the header of a "motive-csv" file overrides it'
     )
     axes: Annotated[tuple[str, str, str], AfterValidator(_each_once)] = Field(

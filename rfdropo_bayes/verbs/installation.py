@@ -25,7 +25,10 @@ TILT, TURN = 0.1, 0.5
 """Standard deviations of the frame's tilt, and of its turn about the body's axis [rad]. That arm's frame was turned by
 0.3 rad."""
 GAIN = 0.1  # standard deviation of the relative error of a command in metres of cable
-UNKNOWN = 0.5  # the same of a robot whose cables' distance from the axis, or whose length, was not given
+UNKNOWN = 0.5
+"""The same of a robot whose cables' distance from the axis, or whose length, was not given; and of pressures and inputs of
+drives, whose force per command no answer states."""
+UNSTATED = ("Pa", "-")  # units of commands whose force per command is not stated
 FEWEST_ROWS = 60  # rows of a recording whose last third, 20 rows, is worth a test
 ROWS_AT_REST = 200
 """Rows at rest that a fit takes, seven for each parameter of a robot with nine cables. There 405 of 1,620 rows left the
@@ -42,7 +45,7 @@ def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[st
     """Mechanisms of the base model: the measuring frame, the body's stiffness in tension, the gain of the drives, the
     scale of lengths if the body's length was ``assumed``, and of a robot with several sections, whose cables pull
     against each other and whose sections are turned by hand, the stretch and the azimuths of its cables."""
-    gain = ["command_gain"] if robot.command_unit == "m" else []
+    gain = ["command_gain"] if robot.command_unit in ("m", *UNSTATED) else []
     scale = ["camera_scale"] if "length" in assumed else []
     sections = ["cable_compliance", "guide_azimuth"] if _pulled_by_section(robot) else []
     return ["axial_stiffness", "camera_rotation", *gain, *scale, *sections]
@@ -83,6 +86,8 @@ def installed_priors(
     if robot.command_unit == "m":
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
+    if robot.command_unit in UNSTATED:
+        normal("command_gain_error", UNKNOWN, "force of a drive over that of the robot file, less 1")
     if "length" in assumed:
         normal("camera_scale_error", UNKNOWN, "lengths over those of the robot file, less 1")
     if _pulled_by_section(robot):

@@ -92,10 +92,16 @@ def test_columns_may_be_in_several_units_of_one_kind():
         (("valve1_bar", "valve2_bar"), "bar"),
         (("p_mbar", "q_mbar"), "mbar"),
         (("pressure_1", "pressure_2"), "bar"),
+        (("F_NE", "F_SW"), "N"),
+        (("tension1", "tension2"), "N"),
+        (("Motor 1 [Grad]", "Motor 2 [Grad]"), "deg"),
+        (("pull_1_in", "pull_2_in"), "in"),
+        (("pull_1 (in)", "pull_2 (in)"), "in"),
+        (("pull_in_1", "pull_in_2"), "mm"),
         (("c1", "c2"), "mm"),
     ],
 )
-def test_percents_volts_and_pressures_are_no_lengths(names, unit):
+def test_units_of_commands_by_their_names(names, unit):
     whole = named(*names)
     assert command_unit(whole, whole.frame, names).unit == unit
 

@@ -99,3 +99,18 @@ def test_an_answer_without_findings_still_shows_the_doubts(demo):
     bands = SimpleNamespace(values=demo.time), SimpleNamespace(values=demo.marker_names)
     prediction = Prediction({"time": bands[0], "marker": bands[1]}, None, cautions=[caution])
     assert f"demo_1: {SWAPPED}" in repr(prediction)
+
+
+@pytest.mark.parametrize(("pulled", "doubts"), [(0.0, 1), (0.01, 0)])
+def test_a_first_row_far_away_is_doubted_unless_cables_were_pulled(pulled, doubts):
+    robot = Robot.outline(name="arm", length=0.2, radius=0.01, markers={"tip": 0.2}, cables=1)
+    bent = Trajectory.from_arrays(
+        time=[0.0, 1.0],
+        position=np.tile([0.15, 0.0, 0.1], (2, 1, 1)),
+        markers=["tip"],
+        channels=["pull_1"],
+        command=[[pulled], [0.01]],
+        initial_command="first",
+    )
+    found = recording_cautions(robot, [bent])
+    assert sum("off the undeformed robot" in each.sentence for each in found) == doubts
