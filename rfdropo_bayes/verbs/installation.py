@@ -26,8 +26,8 @@ TILT, TURN = 0.1, 0.5
 0.3 rad."""
 GAIN = 0.1  # standard deviation of the relative error of a command in metres of cable
 UNKNOWN = 0.5
-"""The same of a robot whose cables' distance from the axis, or whose length, was not given; and of pressures and inputs of
-drives, whose force per command no answer states."""
+"""The same of a robot whose cables' distance from the axis, or whose length, was not given; and of pressures and inputs
+of drives, whose force per command no answer states."""
 UNSTATED = ("Pa", "-")  # units of commands whose force per command is not stated
 FEWEST_ROWS = 60  # rows of a recording whose last third, 20 rows, is worth a test
 ROWS_AT_REST = 200

@@ -9,8 +9,8 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.robots import Robot
 
 LAGGING = 0.03
-"""Share of its way by which a body may lag behind its commands and count as slow. The share is an upper bound: cables of
-imposed lengths and the next rows leave a tenth to a third of it, and `numerical_error` measures it.
+"""Share of its way by which a body may lag behind its commands and count as slow. The share is an upper bound: cables
+that impose lengths hold the body against its damping, and a tenth to a third is left; `numerical_error` measures it.
 """
 SETTLED = 10.0  # times a body's slowest period and its damping's time after which it has come to rest
 
