@@ -19,7 +19,7 @@ ANGLES = ("deg", "rad", "counts")
 PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
 UNITS = ("mm", "cm", "m", "in", *ANGLES, *PASCALS, *FORCES)
-FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ")
+FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ", "[model.groups]")
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
@@ -72,7 +72,7 @@ class Questions:
         if given is not None or not guess.counts:
             return given
         if not self.ask:
-            remedy = "give --counts-per-turn: counts in one turn of the spool, gear included"
+            remedy = "give --counts-per-turn: counts in one turn of the spool, gear included; or --command-unit"
             raise InputError("holds commands or angles in counts", where="--recording", remedy=remedy)
         return typer.prompt("Counts in one turn of the spool, gear included", type=float)
 

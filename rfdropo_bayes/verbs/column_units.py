@@ -39,6 +39,7 @@ FOREIGN = {
 }
 """Units of commands that are neither a length of cable nor an angle of a motor."""
 FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d|(?<![a-z])f_", re.IGNORECASE)
+ENCODER = re.compile(r"(?<![a-z])enc(oder)?(?![a-z])", re.IGNORECASE)
 PRESSURE = re.compile(r"(?<![a-z])pressures?(?![a-z])", re.IGNORECASE)
 PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0  # largest pressures in chambers of soft robots in kPa, and in bar
 ANGLES = ("rad", "deg", named_columns.COUNTS)
@@ -61,6 +62,7 @@ NOT_TOLD, NOT_WHOLE = 2.0, 4.0
 RESTING = 3e-3  # share of the largest coordinate: markers that spread by less rest, and show the rate of noise
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
 """Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
+COUNTS_ABOVE = 1e3  # largest of whole numbers that no cable moves in mm, nor a motor in deg
 METRIC = ("m", "cm", "mm")  # units that are told by a size: inches and centimetres are within a factor of three
 METRES_UP_TO = 0.2  # largest plausible pull of a cable of a soft arm [m]
 
@@ -174,8 +176,11 @@ def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) ->
     if all(PRESSURE.search(name) for name in names):
         unit = "Pa" if largest > PASCALS_ABOVE else "kPa" if largest > KILOPASCALS_ABOVE else "bar"
         return Unit(unit, evidence=f"{_span(names)} reach {largest:.3g}")
-    whole = all(pd.api.types.is_integer_dtype(values[name]) for name in names)
-    evidence = f"{_span(names)} reach {largest:.3g}" + (" in whole numbers, as counts do" if whole else "")
+    evidence = f"{_span(names)} reach {largest:.3g}"
+    if all(pd.api.types.is_integer_dtype(values[name]) for name in names):
+        evidence += " in whole numbers, as counts do"
+        if largest > COUNTS_ABOVE or all(ENCODER.search(name) for name in names):
+            return Unit(named_columns.COUNTS, evidence=evidence)
     return Unit("mm" if largest > METRES_UP_TO else "m", evidence=evidence)
 
 
