@@ -136,8 +136,18 @@ class Measurements:
             model = None if like is None else like.parts[index]
             shared = False if source == RESIDUALS else (None if model is None else model.correlation is not None)
             order, pooled = (None, None) if model is None else (model.order, bool(np.ptp(model.scale) == 0.0))
-            options = {"source": source, "steps": steps, "order": order, "pooled": pooled, "shared": shared}
-            estimates.append(estimate_noise(departures[..., own], valid[..., own], share, **options))
+            estimates.append(
+                estimate_noise(
+                    departures[..., own],
+                    valid[..., own],
+                    share,
+                    source=source,
+                    steps=steps,
+                    order=order,
+                    pooled=pooled,
+                    shared=shared,
+                )
+            )
         return Stacked(tuple(estimates))
 
     @property

@@ -160,8 +160,8 @@ def _response(
         if port.stage == "sensing":
             shift = shown["offset"][lane][:, None, None]
             still = shown["position"][lane] - shift
-            time_step = float(forward.lanes.simulator.description["time_step_s"])
-            parts = {"position": as_sensed(acting, still, commands, time_step) + shift}
+            time_step: Any = forward.lanes.simulator.description["time_step_s"]
+            parts = {"position": as_sensed(acting, still, commands, float(time_step)) + shift}
         else:
             theta = forward.coordinates.physical_values(fit.x[None], forward.slots)[0]
             commands = commands._replace(signals=signals_of(ports, acting))
