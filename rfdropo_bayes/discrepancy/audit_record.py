@@ -15,7 +15,7 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
 from rfdropo_bayes.discrepancy.fit import Fit
 from rfdropo_bayes.discrepancy.gain import LEVELS, noise_distance
-from rfdropo_bayes.discrepancy.law_words import unknown_record
+from rfdropo_bayes.discrepancy.law_words import law_record, ports_record
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.prequential import in_words, prequential, span_in_words
 from rfdropo_bayes.discrepancy.score import likeness
@@ -39,6 +39,8 @@ def record(
 
     ``doubts`` are cautions on its recordings.
     """
+    first = answer.causes.test_series[0]
+    refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
     findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
     base_rms = _rms(answer, answer.base.residual)
@@ -46,7 +48,7 @@ def record(
         "verdict": answer.verdict,
         "sentence": sentence(answer, findings),
         "findings": findings,
-        "candidates": _candidates(answer),
+        "candidates": [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows],
         "between": _between(answer, findings),
         "base_fit_converged": answer.base.converged,
         "out_of_time": bool(answer.cost.stopped),
@@ -56,7 +58,16 @@ def record(
         "adopted": [step.name for step in answer.adopted],
         "unsupported": list(answer.causes.unsupported),
         "bootstraps": answer.problem.rules.bootstraps,
-        "omnibus": [{"after": n, **_omnibus(tests)} for n, tests in enumerate(answer.causes.test_series)],
+        "omnibus": [
+            {
+                "after": n,
+                "p": tests.omnibus.p,
+                "finer_mesh": tests.refined,
+                "tests": tests.omnibus.single,
+                "blocks": [None if np.isnan(block) else block for block in tests.omnibus.blocks.tolist()],
+            }
+            for n, tests in enumerate(answer.causes.test_series)
+        ],
         "gain": None
         if gain is None
         else {
@@ -77,11 +88,16 @@ def record(
         "noise": _noise(answer),
         "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,
-        "remainder": _remainder(answer),
+        "remainder": {
+            "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
+            "length_scale_s": answer.remainder.memory,
+            "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
+        },
         "where": _where(answer),
         "cautions": [caution.as_dict() for caution in (*doubts, *answer.doubts.priors)],
         "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
-        **unknown_record(answer),
+        "ports": ports_record(answer),
+        "law": law_record(answer),
         "next_experiment": next_experiment,
         "rollouts": answer.cost.rollouts,
         "seconds": round(answer.cost.seconds, 2),
@@ -95,23 +111,20 @@ def record(
     }
 
 
-def _remainder(answer: Answer) -> dict[str, Any]:
-    return {
-        "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
-        "length_scale_s": answer.remainder.memory,
-        "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
-    }
-
-
 def _noise(answer: Answer) -> dict[str, Any]:
+    """Noise of the markers in mm, and of other channels in their own units; of tensions as a share of the reading."""
     noise, shift, suspected = answer.target.noise.first, answer.doubts.shift, answer.doubts.suspected
+    parts = zip(answer.target.measurements.channels[1:], answer.target.noise.parts[1:], strict=True)
     return {
         "source": noise.source,
         "order": noise.order,
         "autocorrelation": noise.autocorrelation.tolist(),
         "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
         "correlation_between_channels": None if noise.correlation is None else np.round(noise.correlation, 3).tolist(),
-        "other_channels": _other_noise(answer),
+        "other_channels": {
+            channel.name: {"standard_deviation": part.scale.tolist(), "autocorrelation": part.autocorrelation.tolist()}
+            for channel, part in parts
+        },
         "shift_between_repeats_mm": None if shift is None else MILLIMETRES * shift,
         "suspected_mm": None if suspected is None else (MILLIMETRES * suspected.first.scale).tolist(),
     }
@@ -192,16 +205,6 @@ def _watch(answer: Answer) -> str:
     marker = markers[int(np.argmax(scores.misfit.reshape(-1, 3).sum(axis=1)))]
     first, last = scores.edges[worst : worst + 2]
     return f"watch {marker} while the commands {span_in_words(first, last, answer.problem.timed)} are sent again"
-
-
-def _other_noise(answer: Answer) -> dict[str, Any]:
-    """Noise of the channels beside the markers, in their own units; of tensions as a share of the reading."""
-    parts = zip(answer.target.measurements.channels, answer.target.noise.parts, strict=True)
-    return {
-        channel.name: {"standard_deviation": part.scale.tolist(), "autocorrelation": part.autocorrelation.tolist()}
-        for channel, part in parts
-        if channel is not answer.target.measurements.channels[0]
-    }
 
 
 def _rms(answer: Answer, white: np.ndarray) -> float:
@@ -320,15 +323,6 @@ def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, fl
     return {answer.problem.coordinates.names[i]: named[answer.problem.coordinates.names[i]] for i in free}
 
 
-def _omnibus(tests: ScoreTests) -> dict[str, Any]:
-    return {
-        "p": tests.omnibus.p,
-        "finer_mesh": tests.refined,
-        "tests": tests.omnibus.single,
-        "blocks": [None if np.isnan(block) else block for block in tests.omnibus.blocks.tolist()],
-    }
-
-
 def _where(answer: Answer) -> dict[str, Any]:
     """Time and place of the base model's misfit."""
     scores, problem = prequential(answer.target, answer.base), answer.problem
@@ -341,13 +335,6 @@ def _where(answer: Answer) -> dict[str, Any]:
         "block_p": scores.p.tolist(),
         "marker_misfit": dict(zip(markers, misfit.tolist(), strict=True)),
     }
-
-
-def _candidates(answer: Answer) -> list[dict[str, Any]]:
-    """Score tests of all candidates at the base model, the best first."""
-    first = answer.causes.test_series[0]
-    refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
-    return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]
 
 
 def _candidate(answer: Answer, row: ScoreRow, tests: ScoreTests, refit: float | None) -> dict[str, Any]:

@@ -96,11 +96,6 @@ def rewhitened(
     return other.measurements.whiten(_errors(fit_target, white), other.noise)
 
 
-def noise_updated(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
-    """Target and fit of an improved model: if it was misspecified, refitted under noise of its present residuals."""
-    return (target, fit) if target.known is None else fit_with_noise(target.known, fit.x, fit.free)
-
-
 def noise_share(fit_target: FitTarget) -> float:
     """Mean square of the measurement's noise in deviations of the noise of ``fit_target``; 1 if the model is not
     misspecified.

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.cautions import Caution
@@ -278,12 +277,15 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
             results = replace(results, reached=reached)
             yield results
     target, base = results.reached.settled()
-    problem = _with_differences_of(begun.problem, target)
+    problem, step = begun.problem, target.forward.lanes.difference
+    if step is not None and step != problem.lanes.difference:  # steps that the base fit has found usable
+        finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
+        problem = replace(problem, lanes=target.forward.lanes, finer=finer)
     results = replace(results, problem=problem).after(BASE)
-    report(f"base model fitted; {_noise(target.measured.noise.first)}{_misspecified(target, base)}")
+    report(f"base model fitted; {_noise_in_words(target, base)}")
     firsts = [group[0] for group in target.measurements.members]
-    finer = simulated(problem, True, target.measurements, firsts, clock) if problem.finer else None
-    search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, finer, report)
+    refined = simulated(problem, True, target.measurements, firsts, clock) if problem.finer else None
+    search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, refined, report)
     named = Named(search, base)
     for each in _named(named):
         named, results = each, replace(results, named=each)
@@ -294,8 +296,12 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
         kept, results = each_kept, replace(results, kept=each_kept)
         yield results
     last = kept.named
-    if last.steps and last.fit_target.noise.source == RESIDUALS:
-        kept = replace(kept, named=replace(last, tests=_final_score_tests(last)))
+    if last.steps and last.fit_target.noise.source == RESIDUALS:  # tested under the noise that it leaves itself
+        renewed = replace(last.fit_target, noise=residual_noise(last.fit_target, last.fit))
+        fit = optimise(renewed, last.fit.x, last.fit.free)
+        tests = last.asked.under(renewed).score_tests(fit, last.names)
+        report(f"joint test under the noise that it leaves: p {p_in_words(tests.omnibus.p, problem.rules.bootstraps)}")
+        kept = replace(kept, named=replace(last, tests=tests))
     results = replace(results, kept=kept).after(GAIN)
     yield results
     verdict = _verdict(kept, problem, ended=True)
@@ -371,7 +377,8 @@ def _kept_in_time(results: Results, clock: Deadline) -> Kept:
     """
     named = results.named
     if named is None:
-        target, base = _settled(results.reached, clock)
+        with clock.granted(float("inf")):
+            target, base = results.reached.settled()
         named = Named(
             ExtensionSearch(target, results.problem.candidates, results.problem.rules, results.problem.seed), base
         )
@@ -383,12 +390,6 @@ def _kept_in_time(results: Results, clock: Deadline) -> Kept:
     with suppress(OutOfTime), clock.granted():
         kept = next(iter(keep_supported(results.problem, named)))
     return kept
-
-
-def _settled(reached: Reached, clock: Deadline) -> tuple[FitTarget, Fit]:
-    """Target and fit of a base model that was not fitted to the end."""
-    with clock.granted(float("inf")):
-        return reached.settled()
 
 
 def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
@@ -426,39 +427,20 @@ def _named(begun: Named) -> Iterator[Named]:
     yield again
 
 
-def _with_differences_of(problem: AuditProblem, target: FitTarget) -> AuditProblem:
-    """The problem with derivatives over the steps that the base fit has found usable."""
-    step = target.forward.lanes.difference
-    if step is None or step == problem.lanes.difference:
-        return problem
-    finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
-    return replace(problem, lanes=target.forward.lanes, finer=finer)
-
-
-def _noise(noise: Autoregression) -> str:
-    """Phrase about a noise for progress reports."""
+def _noise_in_words(target: FitTarget, fit: Fit) -> str:
+    """Phrase about the noise, and about a misspecified model, for progress reports."""
+    noise = target.measured.noise.first
     shared = "" if noise.correlation is None else ", shared between coordinates"
-    return f"noise from {noise.source}, AR({noise.order}){shared}"
-
-
-def _misspecified(target: FitTarget, fit: Fit) -> str:
-    """Phrase about a misspecified model for progress reports."""
+    words = f"noise from {noise.source}, AR({noise.order}){shared}"
     if target.known is None:
-        return ""
-    noise, own = target.noise.first.scale, target.measurements.columns[0]
-    deviation = residual_deviation(target, fit)[own]
-    size, share = 1e3 * np.sqrt(3.0 * np.mean(deviation**2)), float(np.mean((deviation / noise) ** 2))
-    return f"; it is misspecified: white noise of {size:.2g} mm, the size of its residuals; a row counts {share:.2g}"
-
-
-def _final_score_tests(last: Named) -> ScoreTests:
-    """The tests of the extended model under the noise that it leaves itself."""
-    renewed = replace(last.fit_target, noise=residual_noise(last.fit_target, last.fit))
-    fit = optimise(renewed, last.fit.x, last.fit.free)
-    tests = last.asked.under(renewed).score_tests(fit, last.names)
-    p = p_in_words(tests.omnibus.p, last.search.rules.bootstraps)
-    last.search.report(f"joint test under the noise that it leaves: p {p}")
-    return tests
+        return words
+    deviation = residual_deviation(target, fit)[target.measurements.columns[0]]
+    size, share = (
+        1e3 * np.sqrt(3.0 * np.mean(deviation**2)),
+        float(np.mean((deviation / target.noise.first.scale) ** 2)),
+    )
+    white = f"white noise of {size:.2g} mm, the size of its residuals"
+    return f"{words}; it is misspecified: {white}; a row counts {share:.2g}"
 
 
 def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:

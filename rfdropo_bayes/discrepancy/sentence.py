@@ -32,7 +32,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         + _unfitted_alone(answer)
         + _suspicion(answer)
         + _shifted(answer)
-        + _decided(answer)
+        + (in_words(answer.doubts.priors) if answer.causes.steps else "")
         + _numerical(answer)
         + _beginning(answer)
         + _left_out(answer)
@@ -108,11 +108,6 @@ def _shifted(answer: Answer) -> str:
     )
 
 
-def _decided(answer: Answer) -> str:
-    """Note on findings while a prior determines a parameter of the base model."""
-    return in_words(answer.doubts.priors) if answer.causes.steps else ""
-
-
 def _numerical(answer: Answer) -> str:
     """Note on a simulation that changes by more than the noise with half the time step."""
     error, noise = answer.doubts.numerical, noise_distance(answer.target.noise.first)
@@ -143,9 +138,11 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if not answer.converged:
         return _unconverged(answer, findings)
     if answer.verdict == NO_DISCREPANCY:
+        refined = answer.causes.test_series[0].refined
+        finer = " on a mesh and time step twice as fine, which differ too little to be named" if refined else ""
         return (
             "No discrepancy: the base model's residuals are consistent with noise in these data (joint "
-            f"test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
+            f"test p {_p(answer)}{finer}{_assumption(answer)}).{_invisible(answer)}"
         )
     if not findings and answer.causes.test_series[0].omnibus.p > answer.problem.rules.base_passes:
         distance = 1e3 * noise_distance(answer.target.noise.first)
@@ -332,12 +329,6 @@ def _remains(answer: Answer) -> str:
     if answer.target.noise.source != REPEATS:
         return remain
     return f"{remain}, {1e3 * noise_distance(answer.target.noise.first):.2g} mm of it noise"
-
-
-def _resolution(answer: Answer) -> str:
-    if answer.causes.test_series[0].refined:
-        return " on a mesh and time step twice as fine, which differ too little to be named"
-    return ""
 
 
 def _assumption(answer: Answer) -> str:

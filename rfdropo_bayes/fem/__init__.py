@@ -8,7 +8,6 @@ from rfdropo_bayes.runtime import configure_jax
 
 configure_jax()
 
-from rfdropo_bayes.fem.balance import energies  # noqa: E402
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
 from rfdropo_bayes.fem.chambers import chamber_layout  # noqa: E402
 from rfdropo_bayes.fem.dynamics import (  # noqa: E402
@@ -24,7 +23,7 @@ from rfdropo_bayes.fem.dynamics import (  # noqa: E402
 )
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
-from rfdropo_bayes.fem.points import distribute_forces, point_positions  # noqa: E402
+from rfdropo_bayes.fem.points import point_positions  # noqa: E402
 from rfdropo_bayes.fem.rod import PointMap, Rod, attach, profile_rod, refined, solid_torsion_constant, uniform_rod  # noqa: E402
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
 
@@ -43,8 +42,6 @@ __all__ = [
     "attach",
     "cable_layout",
     "chamber_layout",
-    "distribute_forces",
-    "energies",
     "material",
     "point_positions",
     "prepare",
