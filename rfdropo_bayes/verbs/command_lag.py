@@ -20,7 +20,7 @@ JUST_BEFORE = 1e-6  # [s] before a row: a command that is sent in it does not ac
 RIDGE = 1e-6  # ridge penalty of the maps, as a share of the mean square of their features
 CLEARLY = 0.9  # ratio of the root mean square residuals of two maps below which the better map is reported
 
-APART = 0.3  # the same ratio of a pose's own row and the row before, below which rows are poses in no order
+APART = 0.3  # the same ratio of two neighbours' commands below which each row is a pose of its own
 
 
 class LagError(NamedTuple):
@@ -35,10 +35,15 @@ def errors_by_row(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2
     return [LagError(lag, _map_error([(own, _shifted(sent, lag)) for own, sent in _series(runs)])) for lag in lags]
 
 
-def poses_apart(run: Trajectory) -> bool:
-    """Whether each row is a pose of its own: it shows its own command, and nothing of the row before."""
-    own, before = errors_by_row([run], (0, 1))
-    return own.error < APART * before.error
+def apart(run: Trajectory) -> str | None:
+    """Why each row is a pose of its own, in words: it shows one command, and nothing of the command before or after.
+
+    None for rows of a continuous motion.
+    """
+    one, other = sorted(each.error for each in errors_by_row([run], (0, 1)))
+    if one >= APART * other:
+        return None
+    return f"a map of one row's command leaves {1e3 * one:.3g} mm, of its neighbour's {1e3 * other:.3g} mm"
 
 
 def best_delay(runs: Sequence[Trajectory]) -> float:

@@ -16,7 +16,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import Workpiece
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.verbs.command_lag import poses_apart
+from rfdropo_bayes.verbs.command_lag import apart
 from rfdropo_bayes.verbs.motion_check import Motion, motion_cautions
 from rfdropo_bayes.verbs.motion_direction import Paths, direction_of
 from rfdropo_bayes.verbs.motion_size import size_of
@@ -42,7 +42,7 @@ def recording_cautions(
         Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")
         for recording in recordings
         for note in recording.notes
-        if note != UNTIMED or not poses_apart(recording)
+        if note != UNTIMED or apart(recording) is None
     ]
     for recording in recordings:
         cautions += _misnamed(recording, robot.marker_names)
