@@ -429,8 +429,8 @@ def _timing_notes(table: CsvTable, columns: CsvColumns, time: Float[np.ndarray, 
         return []
     repeated = repeated_rows(_from_first(table, columns.time, columns.time_unit))
     words = (
-        f"{len(repeated)} of {len(table)} rows, first row {repeated[0]}, have the stamp of the row before: they are taken "
-        "to lie evenly between their neighbours; leave them out if they are copies"
+        f"{len(repeated)} of {len(table)} rows, first row {repeated[0]}, have the stamp of the row before: they are "
+        "taken to lie evenly between their neighbours; leave them out if they are copies"
         if len(repeated)
         else ""
     )

@@ -180,8 +180,8 @@ def spread_repeats(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows
     if not len(repeated):
         return time
     own = np.setdiff1d(np.arange(len(time)), repeated)
-    ended = np.append(time[own], time[-1] + row_interval(time[own]))  # for stamps that are repeated in the last row
-    return np.interp(np.arange(len(time)), np.append(own, len(time)), ended)
+    behind = float(np.median(np.diff(time[own]))) * (len(time) - own[-1])  # for a stamp that the last rows repeat
+    return np.interp(np.arange(len(time)), np.append(own, len(time)), np.append(time[own], time[-1] + behind))
 
 
 def _of_groups(time: np.ndarray, gaps: np.ndarray) -> float:
