@@ -236,7 +236,10 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
     """
     with tempfile.TemporaryDirectory(prefix="rfdropo_") as folder:
         ready, errors = Path(folder) / "ready", Path(folder) / "errors"
-        description = json.dumps(_as_json(table))
+        values = [[index, subindex, value] for (index, subindex), value in table.values.items()]
+        description = json.dumps(
+            table._asdict() | {"bus": table.bus.model_dump(), "values": values, "settings": dict(table.settings)}
+        )
         program = (
             "import sys; from rfdropo_bayes.deployment.bench.simulated_bus import main; main(sys.argv[1], sys.argv[2])"
         )
@@ -258,11 +261,6 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-
-
-def _as_json(table: SimulationTable) -> dict[str, Any]:
-    values = [[index, subindex, value] for (index, subindex), value in table.values.items()]
-    return table._asdict() | {"bus": table.bus.model_dump(), "values": values, "settings": dict(table.settings)}
 
 
 def main(description: str, ready: str) -> None:

@@ -239,7 +239,8 @@ def _search(
         asked = optimiser.ask()
         state = step(key, state, problem, plan, config, asked)
         optimiser.tell(asked, state.losses[-1])
-        checkpoint.save(*_pack(state))
+        arrays = {"candidates": state.candidates, "losses": state.losses}
+        checkpoint.save(arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds})
         logbook.stage(len(state.losses) / len(plan.horizons), method="rfdropo", **state.trace[-1])
     return state, np.clip(optimiser.centre, 0.0, WIDTH)
 
@@ -265,11 +266,6 @@ def _choose(
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
     return finalists[int(np.argmin(scores))], details
-
-
-def _pack(state: SearchState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays = {"candidates": state.candidates, "losses": state.losses}
-    return arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds}
 
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SearchState:
