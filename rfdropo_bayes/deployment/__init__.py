@@ -16,19 +16,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.deployment.session import Mode, Outcome, deploy
     from rfdropo_bayes.deployment.settings import Deployment, load_deployment
 
-__all__ = [
-    "Cause",
-    "Deployment",
-    "Mode",
-    "Outcome",
-    "Plant",
-    "PlantState",
-    "Stop",
-    "deploy",
-    "load_deployment",
-    "session_trajectory",
-]
-
 _HOMES = {
     "Cause": "causes",
     "Stop": "causes",

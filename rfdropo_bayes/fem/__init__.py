@@ -26,32 +26,3 @@ from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.points import point_positions  # noqa: E402
 from rfdropo_bayes.fem.rod import PointMap, Rod, attach, profile_rod, refined, solid_torsion_constant, uniform_rod  # noqa: E402
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
-
-__all__ = [
-    "BendingLaw",
-    "BodyEffects",
-    "CableLayout",
-    "Material",
-    "PointMap",
-    "Prepared",
-    "Rod",
-    "State",
-    "System",
-    "Viscoelasticity",
-    "Wall",
-    "attach",
-    "cable_layout",
-    "chamber_layout",
-    "material",
-    "point_positions",
-    "prepare",
-    "profile_rod",
-    "refined",
-    "simulate",
-    "solid_torsion_constant",
-    "state_at_rest",
-    "static_equilibrium",
-    "step",
-    "uniform_rod",
-    "without_cables",
-]

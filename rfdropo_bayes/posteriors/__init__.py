@@ -12,26 +12,3 @@ from rfdropo_bayes.posteriors.inference_data import (
 )
 from rfdropo_bayes.posteriors.parameter_info import SHARED, DrawsByOwner, ParameterInfo, Scope, by_owner, label
 from rfdropo_bayes.posteriors.record import FIXED, PosteriorRecord, RecordingPrediction
-
-__all__ = [
-    "FIXED",
-    "SHARED",
-    "DrawsByOwner",
-    "InferenceData",
-    "ParameterInfo",
-    "PosteriorRecord",
-    "ProductOfPowers",
-    "RecordingPrediction",
-    "Scope",
-    "by_owner",
-    "central_interval",
-    "contradiction",
-    "contradicts",
-    "cut_off_at",
-    "evaluate_products",
-    "label",
-    "load_posterior",
-    "save_posterior",
-    "summarise",
-    "to_tree",
-]

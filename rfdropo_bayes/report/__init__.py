@@ -6,21 +6,3 @@ from rfdropo_bayes.report.page import render_page
 from rfdropo_bayes.report.run_files import rebuild_report, write_run
 from rfdropo_bayes.report.scores import ErrorFigures, MeasuredPath, measured_paths, score
 from rfdropo_bayes.report.summary import build_summary, read_summary, write_summary
-
-__all__ = [
-    "BaselineErrors",
-    "ErrorFigures",
-    "MeasuredPath",
-    "RecordingFacts",
-    "RunFacts",
-    "baseline_errors",
-    "build_summary",
-    "measured_paths",
-    "read_summary",
-    "rebuild_report",
-    "render_page",
-    "score",
-    "software_versions",
-    "write_run",
-    "write_summary",
-]

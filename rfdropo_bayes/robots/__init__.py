@@ -9,28 +9,3 @@ from rfdropo_bayes.robots.parameter import Parameter
 from rfdropo_bayes.robots.robot import OBJECT, CommandTiming, Marker, PushScene, Robot
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
 from rfdropo_bayes.robots.shape import robot_shape
-
-__all__ = [
-    "OBJECT",
-    "Body",
-    "Cable",
-    "Channels",
-    "CommandTiming",
-    "Cone",
-    "Cylinder",
-    "Disks",
-    "DriveTravel",
-    "Marker",
-    "Motor",
-    "Parameter",
-    "PointMass",
-    "PushScene",
-    "Robot",
-    "Travel",
-    "Tube",
-    "find_robot_file",
-    "known_robots",
-    "robot_shape",
-    "section_profile",
-    "travel_in",
-]

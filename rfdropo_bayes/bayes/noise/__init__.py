@@ -17,21 +17,3 @@ from rfdropo_bayes.bayes.noise.inferred import (
     timeline,
     whiten,
 )
-
-__all__ = [
-    "LASTING_NOISE",
-    "LONG_AGO",
-    "NOISE_CORRELATION_TIME",
-    "NOISE_DEGREES",
-    "NOISE_MODELS",
-    "OBSERVATION_NOISE",
-    "Autoregression",
-    "Noise",
-    "Timeline",
-    "draw_noise",
-    "noise_specs",
-    "noise_values",
-    "row_log_density",
-    "timeline",
-    "whiten",
-]
