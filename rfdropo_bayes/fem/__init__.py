@@ -10,17 +10,7 @@ configure_jax()
 
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
 from rfdropo_bayes.fem.chambers import chamber_layout  # noqa: E402
-from rfdropo_bayes.fem.dynamics import (  # noqa: E402
-    Material,
-    Prepared,
-    State,
-    System,
-    material,
-    prepare,
-    state_at_rest,
-    step,
-    without_cables,
-)
+from rfdropo_bayes.fem.dynamics import Material, System, material, prepare, state_at_rest, step, without_cables  # noqa: E402
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.points import point_positions  # noqa: E402

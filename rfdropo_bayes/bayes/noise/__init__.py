@@ -3,9 +3,7 @@
 from rfdropo_bayes.bayes.noise.autoregression import Autoregression
 from rfdropo_bayes.bayes.noise.inferred import (
     LASTING_NOISE,
-    LONG_AGO,
     NOISE_CORRELATION_TIME,
-    NOISE_DEGREES,
     NOISE_MODELS,
     OBSERVATION_NOISE,
     Noise,
