@@ -162,10 +162,10 @@ def unseen_modes(replicates: int, optimisations: int | None = None) -> list[Caut
     return [Caution(Code.MODES_UNSEEN, sentence)]
 
 
-def exclusion_cautions(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[Caution]:
-    """A caution if more than ``share`` of the rollouts were excluded."""
+def exclusion_cautions(excluded: Mapping[str, int], evaluations: int) -> list[Caution]:
+    """A caution if more than 5 % of the rollouts were excluded."""
     total = sum(excluded.values())
-    if evaluations == 0 or total / evaluations <= share:
+    if evaluations == 0 or total / evaluations <= 0.05:
         return []
     reasons = ", ".join(f"{name} {count}" for name, count in sorted(excluded.items()))
     sentence = f"{total} of {evaluations} rollouts got no weight ({reasons})"

@@ -228,7 +228,7 @@ def run_hub(channel: str) -> None:
 
 
 @contextlib.contextmanager
-def simulated_drives(table: SimulationTable, patience: float = START) -> Iterator[BusTable]:
+def simulated_drives(table: SimulationTable) -> Iterator[BusTable]:
     """The drives in their own process; yields the bus to find them on.
 
     Raises:
@@ -247,7 +247,7 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
             command = [sys.executable, "-c", program, description, str(ready)]
             process = subprocess.Popen(command, stderr=sink)
         try:
-            end = time.monotonic() + patience
+            end = time.monotonic() + START
             while not (ready.is_file() and ready.read_text(encoding="utf-8")):
                 if process.poll() is not None or time.monotonic() > end:
                     said = errors.read_text(encoding="utf-8").strip().splitlines() or ["no word"]
