@@ -13,7 +13,6 @@ from rfdropo_bayes.errors import InputError
 
 if TYPE_CHECKING:
     from rfdropo_bayes.robots.outline import RobotOutline
-    from rfdropo_bayes.verbs.column_names import Guess
 
 ANGLES = ("deg", "rad", "counts")
 PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
@@ -130,7 +129,6 @@ Names = Annotated[
     str | None,
     typer.Option(help='names of all columns of a CSV without a line of names: "t,c1,c2,c3,c4,tip_x,tip_y,tip_z"'),
 ]
-CommandNames = Annotated[str | None, typer.Option("--command-names", help="the same for the CSV that --commands names")]
 SampleTime = Annotated[
     float | None, typer.Option("--sample-time", help="seconds from row to row, if no column holds times")
 ]
@@ -176,7 +174,6 @@ def init(
     counts_per_turn: CountsPerTurn = None,
     position_unit: PositionUnit = None,
     names: Names = None,
-    command_names: CommandNames = None,
     sample_time: SampleTime = None,
     spool_radius: SpoolRadius = None,
     gravity: Gravity = None,
@@ -186,6 +183,7 @@ def init(
     defaults: Defaults = False,
 ) -> None:
     """Write a first robot file and experiment file. Asks for facts that are neither in options nor in recordings."""
+    from rfdropo_bayes.verbs.column_names import guess_columns
     from rfdropo_bayes.verbs.init import (
         assumed_of_columns,
         matching_commands,
@@ -202,7 +200,7 @@ def init(
     guess = None
     if files:
         columns = ask.names(files[0], names, None if cables is None else cables * (segments or 1), markers)
-        guess = _columns(files[0], sent, columns, command_names)
+        guess = guess_columns(files[0], sent[0] if sent else None, columns)
         guess = with_given(guess, command_unit=command_unit, position_unit=position_unit, sample_time=sample_time)
         guess = with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None)
     if folder.suffix in MODELS:
@@ -244,13 +242,6 @@ def _found_lines(robot: Path, experiment: Path) -> list[str]:
     lines = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
     lines += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
     return [line for line in lines if "ASSUMED" in line]
-
-
-def _columns(file: Path, sent: list[Path], names: list[str] | None, command_names: str | None) -> Guess:
-    """Guessed meaning of the columns of the first recording."""
-    from rfdropo_bayes.verbs.column_names import guess_columns
-
-    return guess_columns(file, sent[0] if sent else None, names, _listed(command_names))
 
 
 def _listed(names: str | None) -> list[str] | None:

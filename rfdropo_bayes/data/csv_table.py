@@ -159,7 +159,7 @@ class CsvTable:
             low_memory=False,
             index_col=False,
         )
-        self.frame.columns = _numbered_names(header)
+        self.frame.columns = [name or f"Unnamed: {column}" for column, name in enumerate(header)]
 
     @classmethod
     def of_lines(cls, path: Path, lines: list[str]) -> CsvTable:
@@ -287,11 +287,6 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
     repeated = sorted({name for name in names if name and names.count(name) > 1})  # spreadsheets add nameless columns
     if repeated:
         raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
-
-
-def _numbered_names(header: Sequence[str]) -> list[str]:
-    """Names of columns, with a number for each empty name."""
-    return [name or f"Unnamed: {column}" for column, name in enumerate(header)]
 
 
 def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: int) -> None:

@@ -155,12 +155,11 @@ class Drive:
 
     # Set-up
 
-    def check(self, identity: Identity, check_eds: bool = True) -> dict[str, int]:
+    def check(self, identity: Identity) -> dict[str, int]:
         """Read the drive's identity and check its abilities; nothing is written.
 
         Args:
             identity: identity that the drive must report.
-            check_eds: whether vendor and product of the data sheet must equal those of the drive.
 
         Returns:
             Its identity, statusword, position, supported modes and rated torque.
@@ -176,7 +175,7 @@ class Drive:
             raise InputError(
                 f"is not a CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
             )
-        answers = self._check_identity(identity, check_eds)
+        answers = self._check_identity(identity)
         if self.knows(Object.SUPPORTED_MODES):
             answers["modes"] = self.read(Object.SUPPORTED_MODES)
             if not answers["modes"] & objects.CSP_BIT:
@@ -247,9 +246,9 @@ class Drive:
                     remedy=EDS_REMEDY,
                 )
 
-    def _check_identity(self, identity: Identity, check_eds: bool) -> dict[str, int]:
+    def _check_identity(self, identity: Identity) -> dict[str, int]:
         sheet = self.node.remote.object_dictionary.device_information
-        stated = {"vendor": sheet.vendor_number, "product": sheet.product_number} if check_eds else {}
+        stated = {"vendor": sheet.vendor_number, "product": sheet.product_number}
         answers = {}
         for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
             if not self.knows(Object.IDENTITY, subindex):
@@ -269,7 +268,7 @@ class Drive:
                 raise InputError(
                     f"{key} is 0x{answers[key]:X}, but 0x{stated[key]:X} in the data sheet",
                     where=where,
-                    remedy=f"{EDS_REMEDY}, or set check_eds = false",
+                    remedy=EDS_REMEDY,
                 )
         return answers
 
@@ -558,7 +557,7 @@ class Drives:
             self._next_heartbeat = now + 0.25 * self.guards.master_timeout_s - 1e-3
             self.network.send_message(objects.HEARTBEAT + self.guards.master_node, bytes([NmtState.OPERATIONAL]))
 
-    def quick_stop(self, patience: float = 0.02) -> list[str]:
+    def quick_stop(self) -> list[str]:
         """Stop every drive at once, from any thread, whatever the control loop does; it stays stopped.
 
         The controlword goes out in its own PDO that needs no SYNC. If a frame cannot be sent, the others still
@@ -569,7 +568,7 @@ class Drives:
         """
         self._stopped.set()
         # Behind a cycle that is being sent: its set-points still say "enable", and would undo the stop.
-        locked = self._sending.acquire(timeout=patience)
+        locked = self._sending.acquire(timeout=0.02)
         failures = []
         try:
             for drive in self.all:

@@ -193,9 +193,7 @@ class _Session:
         )
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:
-            self.identities[drive.motor.channel] = drive.check(
-                identity.identity(drive.motor.channel), identity.check_eds
-            )
+            self.identities[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel))
             self.log.event("checked", drive.name, **self.identities[drive.motor.channel])
             self.without[drive.motor.channel] = [f"0x{index:04X}: {LEFT_OUT[index]}" for index in drive.lacking()]
         if self.mode is Mode.HOME:
@@ -263,7 +261,7 @@ class _Session:
             self.robot, self.drives, markers, self.log, safety, self.period, lambda text: self.log.event("stop", text)
         )
         if safety.button_file is not None:
-            hooks = (*hooks, file_hook(Path(safety.button_file), safety.button_pressed))
+            hooks = (*hooks, file_hook(Path(safety.button_file)))
 
         def press(what: str, silence: bool) -> None:
             loop.demanded = Stop(Cause.DEADLINES if silence else Cause.EMERGENCY_STOP, what)

@@ -43,7 +43,9 @@ def record(
     refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
     findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
-    base_rms = _rms(answer, answer.base.residual)
+    measured = answer.target.measurements
+    base_rms = float(np.sqrt(np.mean(measured.series(answer.base.residual)[measured.valid] ** 2)))
+    coordinates, base_x = answer.problem.coordinates, answer.base.x
     return {
         "verdict": answer.verdict,
         "sentence": sentence(answer, findings),
@@ -95,7 +97,9 @@ def record(
         },
         "where": _where(answer),
         "cautions": [caution.as_dict() for caution in (*doubts, *answer.doubts.priors)],
-        "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
+        "base_parameters": {
+            coordinates.names[i]: coordinates.named(base_x)[coordinates.names[i]] for i in answer.base.free
+        },
         "ports": ports_record(answer),
         "law": law_record(answer),
         "next_experiment": next_experiment,
@@ -207,11 +211,6 @@ def _watch(answer: Answer) -> str:
     return f"watch {marker} while the commands {span_in_words(first, last, answer.problem.timed)} are sent again"
 
 
-def _rms(answer: Answer, white: np.ndarray) -> float:
-    measured = answer.target.measurements
-    return float(np.sqrt(np.mean(measured.series(white)[measured.valid] ** 2)))
-
-
 def _shares(answer: Answer) -> list[float | None]:
     """Explained fraction that each step brought."""
     if not answer.validation.stages:
@@ -316,11 +315,6 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
             "unit": f"{unit}/Pa" if power > 0 else f"{unit} Pa",
         }
     return sizes
-
-
-def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, float]:
-    named = answer.problem.coordinates.named(x)
-    return {answer.problem.coordinates.names[i]: named[answer.problem.coordinates.names[i]] for i in free}
 
 
 def _where(answer: Answer) -> dict[str, Any]:

@@ -30,8 +30,9 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.inference import LaplaceConfig, find_modes, maximise, normal_at, optimisation_cost
-from rfdropo_bayes.inference import Target as Climbed
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, find_modes
+from rfdropo_bayes.inference.modes.optimisation import maximise, normal_at, optimisation_cost
+from rfdropo_bayes.inference.modes.targets import Target as Climbed
 from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 

@@ -19,7 +19,7 @@ from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, MISFIT, RESIDUALS
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
-from rfdropo_bayes.inference import lasting_series
+from rfdropo_bayes.inference.modes.lasting import lasting_series
 
 POOR = 2.0  # squared residual per value, in the noise's variance, above which a model is misspecified
 ROUNDS = 6  # of noise and fit in turn

@@ -10,48 +10,9 @@ configure_jax()
 
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
 from rfdropo_bayes.fem.chambers import chamber_layout  # noqa: E402
-from rfdropo_bayes.fem.dynamics import (  # noqa: E402
-    Material,
-    Prepared,
-    State,
-    System,
-    material,
-    prepare,
-    state_at_rest,
-    step,
-    without_cables,
-)
+from rfdropo_bayes.fem.dynamics import Material, System, material, prepare, state_at_rest, step, without_cables  # noqa: E402
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
 from rfdropo_bayes.fem.points import point_positions  # noqa: E402
 from rfdropo_bayes.fem.rod import PointMap, Rod, attach, profile_rod, refined, solid_torsion_constant, uniform_rod  # noqa: E402
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
-
-__all__ = [
-    "BendingLaw",
-    "BodyEffects",
-    "CableLayout",
-    "Material",
-    "PointMap",
-    "Prepared",
-    "Rod",
-    "State",
-    "System",
-    "Viscoelasticity",
-    "Wall",
-    "attach",
-    "cable_layout",
-    "chamber_layout",
-    "material",
-    "point_positions",
-    "prepare",
-    "profile_rod",
-    "refined",
-    "simulate",
-    "solid_torsion_constant",
-    "state_at_rest",
-    "static_equilibrium",
-    "step",
-    "uniform_rod",
-    "without_cables",
-]

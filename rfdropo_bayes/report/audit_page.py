@@ -47,7 +47,10 @@ def render_audit(
         title=title,
         sections=SECTIONS,
         pictures=_pictures(seen, outline),
-        classes=[(c, embed(figures.class_figure(seen.residuals, c), _caption(c))) for c in seen.classes],
+        classes=[
+            (c, embed(figures.class_figure(seen.residuals, c), f"Misfit with and without {display_name(c.names[0])}"))
+            for c in seen.classes
+        ],
         replayed=replay(seen.tracks, outline),
         config=config,
     )
@@ -177,10 +180,6 @@ def _signal(answer: Answer) -> figures.Signal | None:
         row = next(each for each in described.search.ports if each.port in members)
     names = answer.target.measurements.names
     return figures.Signal(row.port.words, row.port.unit, names, described.search.centre, row.mean, row.sd)
-
-
-def _caption(effect: figures.ClassEffect) -> str:
-    return f"Misfit with and without {display_name(effect.names[0])}"
 
 
 def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:

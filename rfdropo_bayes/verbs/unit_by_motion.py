@@ -29,7 +29,7 @@ def driven_motion(
     `MOST_TURN`.
     """
     place = np.linspace(min(cable.anchor_z_m for cable in robot.cables), max(heights), STEPS)
-    pull = _pulls(robot, command)
+    pull = command @ np.asarray(robot.channel_matrix(robot.nominal()), dtype=float).T
     if np.linalg.norm(_turns(robot, pull, place), axis=2).max() > MOST_TURN:
         return None
     turn = _turns(robot, np.clip(pull, *np.array(robot.drive_limits()).T), place)
@@ -55,11 +55,6 @@ def _turns(
         turn += share[:, None, None] * (whole - reached)
         below, reached = float(end), whole
     return turn
-
-
-def _pulls(robot: Robot, command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row cable"]:
-    """Commanded pull of each cable [m]."""
-    return command @ np.asarray(robot.channel_matrix(robot.nominal()), dtype=float).T
 
 
 def spread(position: Float[np.ndarray, "row marker axis"]) -> float:
