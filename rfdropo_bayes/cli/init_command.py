@@ -18,7 +18,7 @@ ANGLES = ("deg", "rad", "counts")
 PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
 UNITS = ("mm", "cm", "m", "in", *ANGLES, *PASCALS, *FORCES)
-FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ", "[model.groups]")
+FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ", "unwrap = ", "[model.groups]")
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
@@ -191,6 +191,7 @@ def init(
         of_robot,
         with_counts,
         with_given,
+        with_turns,
         write_first_files,
     )
 
@@ -202,7 +203,7 @@ def init(
         columns = ask.names(files[0], names, None if cables is None else cables * (segments or 1), markers)
         guess = guess_columns(files[0], sent[0] if sent else None, columns)
         guess = with_given(guess, command_unit=command_unit, position_unit=position_unit, sample_time=sample_time)
-        guess = with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None)
+        guess = with_turns(with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None))
     if folder.suffix in MODELS:
         _init_model(folder, files, sent, guess)
         return

@@ -138,7 +138,7 @@ def audit(
     start = start_values(fit)
     problem = build_problem(spec, table, runs, test, chosen, start=start, workshop=workshop, groups=groups)
     tables = model.record({"title": model.title, "seed": chosen}, {})
-    doubts = cautions_of_audit(model, [*runs, *test], nominal_paths(problem))
+    doubts = cautions_of_audit(model, [*runs, *test], fitted_paths(problem, start or {}))
 
     def audited(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
@@ -159,12 +159,15 @@ def audit(
     return answered
 
 
-def nominal_paths(problem: AuditProblem) -> list[Paths]:
-    """The fitted recordings beside the nominal model; empty if an object is pushed, or a rollout fails."""
+def fitted_paths(problem: AuditProblem, start: Mapping[str, float]) -> list[Paths]:
+    """The fitted recordings beside the model at the start of the audit: nominal, but for values of an earlier fit.
+
+    Empty if an object is pushed, or a rollout fails.
+    """
     if "object_pose" in problem.lanes.fields:
         return []
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
-    values = problem.coordinates.nominal
+    values = problem.coordinates.nominal | start
     theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
     fields, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
     valid = np.asarray(recordings.line.valid)

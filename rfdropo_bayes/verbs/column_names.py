@@ -106,6 +106,7 @@ class Guess(NamedTuple):
     seen: Float[np.ndarray, "row marker 3"]  # marker positions in the first rows, both in the file's units
     counts_per_turn: float | None = None  # counts per turn of the spool, if a unit is "counts"
     sample_time: float | None = None  # given time from row to row [s]; None for rows with times, or without any
+    unwrap: Mapping[str, float] = {}  # turn of each counter that begins anew in the first rows, by its column
 
     @property
     def counts(self) -> bool:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
+from rfdropo_bayes.data.counters import Column, Motion, quoted_key, read_on, turns_of, wraps_of
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
@@ -111,6 +112,18 @@ def with_counts(guess: Guess, counts: float | None, unit_given: bool) -> Guess:
         raise InputError(f"commands are in {guess.command_unit}", where="--counts-per-turn", remedy=remedy)
     unit = guess.command_unit if guess.counts else COUNTS
     return guess._replace(counts_per_turn=counts, command_unit=unit)
+
+
+def with_turns(guess: Guess) -> Guess:
+    """A guess whose counters are read on across their turns, if they jump by a known turn and no marker follows."""
+    rows = np.arange(len(guess.sent), dtype=float)
+    if len(guess.seen) != len(rows):
+        return guess
+    turns = turns_of(guess.command_unit, guess.counts_per_turn, guess.sent)
+    columns = [Column(name, own, turns) for name, own in zip(guess.commands, guess.sent.T, strict=True)]
+    wraps = wraps_of(columns, Motion(rows, rows, guess.seen.reshape(len(rows), -1)))
+    unwrap = {name: each.turn for name, each in wraps.items() if each.known}
+    return guess._replace(unwrap=unwrap, sent=read_on(guess.sent, guess.commands, unwrap))
 
 
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
@@ -354,6 +367,9 @@ def data_tables(
     if guess.motor_angles:
         optional += [f"motor_angles = {quoted(guess.motor_angles)}", _unit_line(guess, "motor_angle_unit")]
     counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
+    wraps = ", ".join(f"{quoted_key(name)} = {turn:.10g}" for name, turn in guess.unwrap.items())
+    if wraps:
+        counts.append(f"unwrap = {{{wraps}}}  # ASSUMED: the columns jump by this turn, and no marker follows")
     unused = [f"# not used: {', '.join(guess.unused)}"] if guess.unused else []
     return [
         "[data]",

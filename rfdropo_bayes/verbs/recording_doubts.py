@@ -69,7 +69,7 @@ def cautions_of_fit(
 
 
 def cautions_of_audit(model: Model, recordings: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
-    """Doubts for an audit, with ``paths`` of the nominal model."""
+    """Doubts for an audit, with ``paths`` of the model that it starts from."""
     return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
 
 

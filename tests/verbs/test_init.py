@@ -16,6 +16,7 @@ from rfdropo_bayes.model.experiment import load_experiment, matching
 from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_names import guess_columns, suggested_names
+from rfdropo_bayes.verbs.init import data_tables, with_counts, with_turns
 
 ROWS = 40
 TIME = 0.05 * np.arange(ROWS)
@@ -76,6 +77,19 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.tensions == [f"tension{k}" for k in range(1, 5)]
     assert guess.motor_angles == [f"motor{k}_meas" for k in range(1, 5)]
     assert guess.unused == ["battery"]
+
+
+def test_counters_that_begin_anew_are_read_on(tmp_path):
+    run = table("t", "{marker}_{axis}", "enc{0}")
+    turns = 3000.0 * np.sin(3.0 * TIME)
+    run["enc1"] = np.round(turns).astype(int) % 4096
+    run["tip_x"] = 0.01 * turns
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = with_turns(with_counts(guess_columns(tmp_path / "run.csv"), 4096.0, unit_given=False))
+    assert guess.unwrap == {"enc1": 4096.0}
+    np.testing.assert_allclose(np.diff(guess.sent[:, 0]), np.diff(turns), atol=1.0)
+    (line,) = (line for line in data_tables(tmp_path, ["low", "tip"], [], [], guess) if line.startswith("unwrap"))
+    assert line.startswith("unwrap = {enc1 = 4096}  # ASSUMED")
 
 
 @pytest.mark.parametrize(("names", "unit"), [("F_{0}", "N"), ("tension{0}", "N"), ("enc{0}_counts", "counts")])
