@@ -78,6 +78,16 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.unused == ["battery"]
 
 
+@pytest.mark.parametrize(("names", "unit"), [("F_{0}", "N"), ("tension{0}", "N"), ("enc{0}_counts", "counts")])
+def test_measured_forces_and_angles_stand_for_commands_that_nobody_recorded(tmp_path, names, unit):
+    run = table("t", "{marker}_{axis}", names)
+    run["battery_V"] = 12.0
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.commands, guess.command_unit) == ([names.format(k) for k in range(1, 5)], unit)
+    assert (guess.tensions, guess.motor_angles) == ([], [])
+
+
 def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(tmp_path):
     run = table("Zeit [ms]", "{marker}_{axis}", "motor{0}", factor=1e3)
     run.insert(0, "latency [ms]", 3.0)
