@@ -129,6 +129,7 @@ Names = Annotated[
     str | None,
     typer.Option(help='names of all columns of a CSV without a line of names: "t,c1,c2,c3,c4,tip_x,tip_y,tip_z"'),
 ]
+CommandNames = Annotated[str | None, typer.Option("--command-names", help="the same for the CSV that --commands names")]
 SampleTime = Annotated[
     float | None, typer.Option("--sample-time", help="seconds from row to row, if no column holds times")
 ]
@@ -174,6 +175,7 @@ def init(
     counts_per_turn: CountsPerTurn = None,
     position_unit: PositionUnit = None,
     names: Names = None,
+    command_names: CommandNames = None,
     sample_time: SampleTime = None,
     spool_radius: SpoolRadius = None,
     gravity: Gravity = None,
@@ -200,7 +202,7 @@ def init(
     guess = None
     if files:
         columns = ask.names(files[0], names, None if cables is None else cables * (segments or 1), markers)
-        guess = guess_columns(files[0], sent[0] if sent else None, columns)
+        guess = guess_columns(files[0], sent[0] if sent else None, columns, _listed(command_names))
         guess = with_given(guess, command_unit=command_unit, position_unit=position_unit, sample_time=sample_time)
         guess = with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None)
     if folder.suffix in MODELS:

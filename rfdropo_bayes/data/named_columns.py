@@ -93,6 +93,9 @@ class CsvColumns(BaseModel):
     names: list[str] | None = Field(
         default=None, description="names of all columns, in their order, of a CSV without a line of names"
     )
+    command_names: list[str] | None = Field(
+        default=None, description="names of all columns of the file of commands, for a CSV without a line of names"
+    )
     time: str | None = Field(
         default=None,
         description="column of the times: numbers in time_unit, or dates (ISO 8601); or give sample_time; "
@@ -196,13 +199,14 @@ class CsvColumns(BaseModel):
     orientations: list[list[str]] | None = Field(
         default=None,
         description="columns of the orientation of each of sections: a unit quaternion x, y, z, w, or a rotation "
-        "vector x, y, z [rad], from the undeformed body, along the file's axes; empty rows are left "
+        "vector x, y, z in rotation_unit, from the undeformed body, along the file's axes; empty rows are left "
         "out",
     )
     sections: list[str] | None = Field(
         default=None,
         description="names of orientations in the robot file ([[orientations]]), in the order of the columns",
     )
+    rotation_unit: Literal["rad", "deg"] = Field(default="rad", description="unit of rotation vectors")
     robot: str = Field("", description="name of the robot that was recorded")
 
     @model_validator(mode="before")
@@ -523,6 +527,7 @@ def _orientations(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "ro
     for k, names in enumerate(columns.orientations):
         read = table.numbers(names, allow_missing=True)
         known = np.isfinite(read).all(axis=1)
-        turn = Rotation.from_rotvec(read[known]) if len(names) == 3 else Rotation.from_quat(read[known])
+        vector = COMMAND_UNITS[columns.rotation_unit][1] * read[known]
+        turn = Rotation.from_rotvec(vector) if len(names) == 3 else Rotation.from_quat(read[known])
         turned[known, k] = (axes * turn * axes.inv()).as_quat()
     return turned

@@ -97,8 +97,9 @@ class Guess(NamedTuple):
     command_time: str | None
     command_time_unit: str
     units: Mapping[str, str]  # units of columns other than command_unit or position_unit
-    # names: given names of all columns, for files without names
+    # names, command_names: given names of all columns, for files without names
     names: list[str] | None
+    command_names: list[str] | None
     # why a unit was guessed, by its key in [data.columns]; no entry for a unit stated in the file
     evidence: Mapping[str, str]
     start: Float[np.ndarray, "marker 3"]  # first seen position of each marker, in the file's frame and unit
@@ -113,13 +114,15 @@ class Guess(NamedTuple):
         return named_columns.COUNTS in (self.command_unit, self.motor_angle_unit if self.motor_angles else "")
 
 
-def guess_columns(path: Path, sent: Path | None = None, names: Sequence[str] | None = None) -> Guess:
+def guess_columns(
+    path: Path, sent: Path | None = None, names: Sequence[str] | None = None, command_names: Sequence[str] | None = None
+) -> Guess:
     """Guess the meaning of a recording's columns.
 
     Args:
         path: a CSV, an export of Motive's, a bag, a LeRobotDataset, or a file of arrays.
         sent: a CSV with the commands, if separate.
-        names: column names of a CSV without names.
+        names: column names of a CSV without names; command_names: the same for the commands' file.
 
     Raises:
         InputError: a file that cannot be read, or in which no positions or commands are found.
@@ -134,7 +137,7 @@ def guess_columns(path: Path, sent: Path | None = None, names: Sequence[str] | N
     positions = list(triples.values())
     source, sending, clock = table, whole, None
     if sent is not None:
-        sending = CsvTable(sent, (), machine_written=False)
+        sending = CsvTable(sent, (), names=command_names, machine_written=False)
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name != clock]
     measured = [] if sent is not None else angles or tensions
@@ -167,6 +170,7 @@ def guess_columns(path: Path, sent: Path | None = None, names: Sequence[str] | N
         command_time=clock,
         units={**units["command_unit"].others, **units["position_unit"].others},
         names=None if names is None else list(names),
+        command_names=None if command_names is None else list(command_names),
         evidence={key: unit.evidence for key, unit in units.items() if unit.evidence},
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
         sent=source[commands].to_numpy(dtype=float),

@@ -365,6 +365,7 @@ def data_tables(
         "# Guessed from the names and sizes of the columns: look them over.",
         "[data.columns]",
         *([] if guess.names is None else [f"names = {quoted(guess.names)}  # of all columns: the file has none"]),
+        *([] if guess.command_names is None else [f"command_names = {quoted(guess.command_names)}"]),
         *_clock(guess),
         f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order"
         + (f"; ASSUMED: {order}" if order else ""),

@@ -80,7 +80,7 @@ def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> d
         "markers": guess.markers,
     }
     columns |= {} if guess.counts_per_turn is None else {"counts_per_turn": guess.counts_per_turn}
-    columns |= {"units": dict(guess.units), "names": guess.names}
+    columns |= {"units": dict(guess.units), "names": guess.names, "command_names": guess.command_names}
     if guess.sample_time is None:
         columns |= {"time": guess.time or ROWS, "time_unit": guess.time_unit}
     else:

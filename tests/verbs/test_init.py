@@ -331,6 +331,21 @@ def test_a_file_without_names_is_read_by_the_names_that_init_suggests(tmp_path, 
     assert read.marker_names == ("low", "tip")
 
 
+def test_positions_and_commands_may_be_two_files_without_names(tmp_path, monkeypatch, capsys):
+    run = table("t", "{marker}_{axis}", "u{0}")
+    sent = [name for name in run if name.startswith("u")]
+    run.drop(columns=sent).to_csv(tmp_path / "run.csv", index=False, header=False)
+    run[["t", *sent]].to_csv(tmp_path / "sent.csv", index=False, header=False)
+    monkeypatch.chdir(tmp_path)
+    words = ["--recording", "run.csv", "--commands", "sent.csv", "--length-mm", "200", "--cables", "4"]
+    words += ["--markers", "low=100,tip=200", "--names", ",".join(name for name in run if name not in sent)]
+    status, told = init(monkeypatch, capsys, "arm", *words, "--command-names", ",".join(["t", *sent]))
+    assert status == 0, told
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (read,) = load_recordings(experiment.data, tmp_path / "arm")
+    np.testing.assert_allclose(read.command, 1e-3 * run[sent])
+
+
 @pytest.mark.parametrize(
     ("rows", "commands", "markers", "names"),
     [
