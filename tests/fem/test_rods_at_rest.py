@@ -18,8 +18,8 @@ SYSTEM = fem.System(fem.uniform_rod(1.0, HALF, HALF, ELEMENTS), fem.without_cabl
 END_LOAD = {1.0: (0.30172, 0.05643), 2.0: (0.49346, 0.16064), 5.0: (0.71379, 0.38763), 10.0: (0.81061, 0.55500)}
 # Heavy elastica: w L^3 / E I -> x / L, y / L.
 OWN_WEIGHT = {1.0: (0.99125, 0.12347), 2.0: (0.96689, 0.23851), 5.0: (0.84666, 0.49591), 10.0: (0.65635, 0.70020)}
-# Princeton beam: tip by load [N], along the height and the thickness of the section [m], for a load turned by 15 degrees,
-# from 0 to 90. Beam elements of ANSYS in Obrezkov et al. (2022), Nonlinear Dynamics 109, on ANCF beam elements.
+# Princeton beam, by load [N]: tip along the section's height and thickness [m], for loads from 0 to 90 degrees between
+# both, every 15. Beam elements of ANSYS in Obrezkov et al. (2022), Nonlinear Dynamics 109, on ANCF beam elements.
 PRINCETON = {
     8.896: (
         (0.0107142, 0.0106133, 0.0101117, 0.0088372, 0.0066047, 0.0035389, 0.0),
