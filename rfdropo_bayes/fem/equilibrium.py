@@ -165,7 +165,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
     none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)
-    turns = np.array([[1.0]] * 3 + [[float(cables > 0)]] * 3)
+    turns = jnp.asarray([[1.0]] * 3 + [[float(cables > 0)]] * 3)
 
     def one(current: _Iterate) -> _Iterate:
         bonds = _bonds(system, task, current.place, current.impulse[:cables])
