@@ -51,7 +51,7 @@ def command_table(path: Path | None, columns: CsvColumns) -> CsvTable | None:
     """The file of the commands, if it is separate."""
     if path is None:
         return None
-    return CsvTable(path, columns.commands, machine_written=False)
+    return CsvTable(path, columns.commands, names=columns.command_names, machine_written=False)
 
 
 def read_csv_start(path: Path, columns: CsvColumns, start: CsvTable | None) -> Trajectory:
@@ -82,7 +82,7 @@ def command_columns(
 
 def _commands_alone(path: Path, columns: CsvColumns) -> CsvTable:
     """A file of commands to predict from, with the columns of either file of a recording."""
-    return CsvTable(path, columns.commands, names=columns.names, machine_written=False)
+    return CsvTable(path, columns.commands, names=columns.command_names or columns.names, machine_written=False)
 
 
 def holds_commands_alone(path: Path, columns: CsvColumns) -> bool:

@@ -155,11 +155,12 @@ class Drive:
 
     # Set-up
 
-    def check(self, identity: Identity) -> dict[str, int]:
+    def check(self, identity: Identity, check_eds: bool = True) -> dict[str, int]:
         """Read the drive's identity and check its abilities; nothing is written.
 
         Args:
             identity: identity that the drive must report.
+            check_eds: whether vendor and product of the data sheet must equal those of the drive.
 
         Returns:
             Its identity, statusword, position, supported modes and rated torque.
@@ -175,7 +176,7 @@ class Drive:
             raise InputError(
                 f"is not a CiA 402 drive (device type 0x{kind:08X})", where=self.name, remedy="correct its node or axis"
             )
-        answers = self._check_identity(identity)
+        answers = self._check_identity(identity, check_eds)
         if self.knows(Object.SUPPORTED_MODES):
             answers["modes"] = self.read(Object.SUPPORTED_MODES)
             if not answers["modes"] & objects.CSP_BIT:
@@ -246,9 +247,9 @@ class Drive:
                     remedy=EDS_REMEDY,
                 )
 
-    def _check_identity(self, identity: Identity) -> dict[str, int]:
+    def _check_identity(self, identity: Identity, check_eds: bool) -> dict[str, int]:
         sheet = self.node.remote.object_dictionary.device_information
-        stated = {"vendor": sheet.vendor_number, "product": sheet.product_number}
+        stated = {"vendor": sheet.vendor_number, "product": sheet.product_number} if check_eds else {}
         answers = {}
         for subindex, (key, expected) in enumerate(identity._asdict().items(), start=1):
             if not self.knows(Object.IDENTITY, subindex):
@@ -268,7 +269,7 @@ class Drive:
                 raise InputError(
                     f"{key} is 0x{answers[key]:X}, but 0x{stated[key]:X} in the data sheet",
                     where=where,
-                    remedy=EDS_REMEDY,
+                    remedy=f"{EDS_REMEDY}, or set check_eds = false",
                 )
         return answers
 

@@ -48,6 +48,7 @@ class SensorTable(BaseModel):
     Attributes:
         kind: "natnet", "simulated" or "none".
         server, local: addresses of Motive's machine and of this machine (natnet).
+        multicast: whether Motive streams by multicast (natnet).
         rigid_bodies: marker name -> identifier of the rigid body in Motive (natnet).
         object_body: identifier of the rigid body that the robot pushes (natnet); its pivot is the object's centre.
             Create the rigid body in Motive while the object is aligned with the robot's base.
@@ -63,6 +64,7 @@ class SensorTable(BaseModel):
     kind: Literal["natnet", "simulated", "none"] = "none"
     server: str = "127.0.0.1"
     local: str = "127.0.0.1"
+    multicast: bool = True
     rigid_bodies: dict[str, int] = {}
     object_body: int | None = None
     rotation: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -184,7 +186,7 @@ class NatNetMarkers:
             raise InputError(
                 "natnet is not installed", where="sensor", remedy="pip install rfdropo_bayes[deploy]"
             ) from None
-        client = NatNetClient(table.server, table.local)
+        client = NatNetClient(table.server, table.local, use_multicast=table.multicast)
         client.on_data_frame_received_event.handlers.append(self.receive)
         try:
             client.connect(timeout=3.0)

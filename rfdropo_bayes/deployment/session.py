@@ -193,7 +193,9 @@ class _Session:
         )
         self.drives = Drives(self.network, drives, guards)
         for drive in drives:
-            self.identities[drive.motor.channel] = drive.check(identity.identity(drive.motor.channel))
+            self.identities[drive.motor.channel] = drive.check(
+                identity.identity(drive.motor.channel), identity.check_eds
+            )
             self.log.event("checked", drive.name, **self.identities[drive.motor.channel])
             self.without[drive.motor.channel] = [f"0x{index:04X}: {LEFT_OUT[index]}" for index in drive.lacking()]
         if self.mode is Mode.HOME:

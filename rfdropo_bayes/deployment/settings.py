@@ -29,6 +29,8 @@ class DrivesTable(_Table):
         eds: their electronic data sheet; the simulated drive's sheet by default.
         vendor, product, revision: required values in object 0x1018; unchecked if left out.
         serial: channel -> serial number.
+        check_eds: whether vendor and product in the data sheet must equal the drive's own; some makers leave them out
+            of step.
         answer_s: a drive has this long to answer an SDO request; more for drives that write to slow memory.
         torque_unit: unit of the rated torque, object 0x6076; "uN m" for maxon's EPOS4.
         speed_unit: unit of the greatest motor speed, object 0x6080; rpm by default, as in the standard.
@@ -43,6 +45,7 @@ class DrivesTable(_Table):
     product: int | None = None
     revision: int | None = None
     serial: dict[str, int] = {}
+    check_eds: bool = True
     answer_s: float = Field(default=0.3, gt=0.0)
     torque_unit: TorqueUnit = "mN m"
     speed_unit: SpeedUnit | None = None

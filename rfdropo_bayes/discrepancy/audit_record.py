@@ -39,9 +39,9 @@ def record(
 
     ``doubts`` are cautions on its recordings.
     """
-    first = answer.causes.test_series[0]
-    refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
-    findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
+    first = answer.test_series[0]
+    refits = answer.steps[0].refits if answer.steps else answer.refits
+    findings = [_finding(answer, step, stage) for step, stage in zip(answer.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
     measured = answer.target.measurements
     base_rms = float(np.sqrt(np.mean(measured.series(answer.base.residual)[measured.valid] ** 2)))
@@ -58,7 +58,7 @@ def record(
         "not_done": list(answer.cost.unfinished),
         "left_out": dict(answer.problem.left_out),
         "adopted": [step.name for step in answer.adopted],
-        "unsupported": list(answer.causes.unsupported),
+        "unsupported": list(answer.unsupported),
         "bootstraps": answer.problem.rules.bootstraps,
         "omnibus": [
             {
@@ -68,7 +68,7 @@ def record(
                 "tests": tests.omnibus.single,
                 "blocks": [None if np.isnan(block) else block for block in tests.omnibus.blocks.tolist()],
             }
-            for n, tests in enumerate(answer.causes.test_series)
+            for n, tests in enumerate(answer.test_series)
         ],
         "gain": None
         if gain is None
@@ -86,7 +86,7 @@ def record(
         },
         "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},
         "noise_floor_mm": MILLIMETRES * noise_distance(noise) if noise.source == REPEATS else None,
-        "numerical_error_mm": None if answer.doubts.numerical is None else MILLIMETRES * answer.doubts.numerical,
+        "numerical_error_mm": None if answer.numerical is None else MILLIMETRES * answer.numerical,
         "noise": _noise(answer),
         "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,
@@ -96,7 +96,7 @@ def record(
             "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
         },
         "where": _where(answer),
-        "cautions": [caution.as_dict() for caution in (*doubts, *answer.doubts.priors)],
+        "cautions": [caution.as_dict() for caution in (*doubts, *answer.priors)],
         "base_parameters": {
             coordinates.names[i]: coordinates.named(base_x)[coordinates.names[i]] for i in answer.base.free
         },
@@ -117,7 +117,7 @@ def record(
 
 def _noise(answer: Answer) -> dict[str, Any]:
     """Noise of the markers in mm, and of other channels in their own units; of tensions as a share of the reading."""
-    noise, shift, suspected = answer.target.noise.first, answer.doubts.shift, answer.doubts.suspected
+    noise, shift, suspected = answer.target.noise.first, answer.shift, answer.suspected
     parts = zip(answer.target.measurements.channels[1:], answer.target.noise.parts[1:], strict=True)
     return {
         "source": noise.source,
@@ -136,7 +136,7 @@ def _noise(answer: Answer) -> dict[str, Any]:
 
 def next_experiment(answer: Answer) -> dict[str, Any]:
     """Next step at the robot, in a sentence, and the candidates that it distinguishes."""
-    apart = next((step for step in answer.causes.steps if len(step.members) > 1), None)
+    apart = next((step for step in answer.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
         words = "No change is needed for commands like these; record larger and faster commands, and audit them."
     elif answer.verdict == NEGLIGIBLE:
@@ -148,11 +148,11 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--from)."
     elif not answer.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --from."
-    elif answer.doubts.suspected is not None:
+    elif answer.suspected is not None:
         words = "Repeat one command sequence three times: the repeats show whether the noise agrees with [noise]."
     elif answer.target.noise.doubtful:
         words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
-    elif answer.verdict == UNEXPLAINED and answer.causes.steps:
+    elif answer.verdict == UNEXPLAINED and answer.steps:
         words = f"No candidate explains it: {_watch(answer)}, for a cause to add as in docs/mechanisms.md."
     elif answer.verdict == NO_VERDICT:
         words = "Nothing yet: raise [audit] minutes, and go on with --resume."
@@ -161,8 +161,8 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         both = " from ".join(spoken(member) for member in apart.members[:2])
         words = f"To tell {both}: {checks}. Or let `rfdropo design` propose commands that differ."
         return {"sentence": words, "separates": list(apart.members)}
-    elif not answer.causes.steps:
-        leading = [row.name for row in answer.causes.test_series[0].rows[:2]]
+    elif not answer.steps:
+        leading = [row.name for row in answer.test_series[0].rows[:2]]
         asked = " and ".join(spoken(each) for each in leading) or "candidates of your own"
         words = (
             f"Send the commands that `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
@@ -170,7 +170,7 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         return {"sentence": words, "separates": leading}
     else:
         name, share = _largest(answer)
-        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.causes.steps) > 1 else ""
+        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.steps) > 1 else ""
         where = "Refine the simulation" if name == DISCRETISATION else f"Check {spoken(name)} on the robot"
         words = f"{where}{most}: {_remedy(answer, name)}."
         if not answer.adopted:
@@ -189,7 +189,7 @@ def _doubt(answer: Answer) -> str:
 
 def _largest(answer: Answer) -> tuple[str, float | None]:
     """The step that explains most of the discrepancy, and the share; the first step if no share is known."""
-    shares = zip(answer.causes.steps, _shares(answer), strict=True)
+    shares = zip(answer.steps, _shares(answer), strict=True)
     step, share = max(shares, key=lambda entry: -np.inf if entry[1] is None else entry[1])
     return step.name, share
 
@@ -214,12 +214,12 @@ def _watch(answer: Answer) -> str:
 def _shares(answer: Answer) -> list[float | None]:
     """Explained fraction that each step brought."""
     if not answer.validation.stages:
-        return [None] * len(answer.causes.steps)
+        return [None] * len(answer.steps)
     return [float(v) for v in np.diff([0.0, *answer.validation.stages])]
 
 
 def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]:
-    gain = answer.validation.gain if len(answer.causes.steps) == 1 else None
+    gain = answer.validation.gain if len(answer.steps) == 1 else None
     row = step.before.row(step.name)
     candidate = answer.problem.candidate(step.name)
     mechanism = candidate.mechanism if candidate else None
@@ -250,7 +250,7 @@ def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, An
     if groups is None:
         return None
     keys = ("mechanism", "group", "parameters", "relative", "log_bayes_factor")
-    alike = [list(step.members[1:]) for step in answer.causes.steps]
+    alike = [list(step.members[1:]) for step in answer.steps]
     rows = [
         {**{key: finding[key] for key in keys}, "not_told_from": others}
         for finding, others in zip(findings, alike, strict=True)
@@ -356,7 +356,7 @@ def _candidate(answer: Answer, row: ScoreRow, tests: ScoreTests, refit: float | 
         "would_explain": row.lm / max(float(tests.fit.residual @ tests.fit.residual), 1e-300),
         "tried_at": at,
         "log_bayes_factor": refit,
-        "named": any(step.name == row.name for step in answer.causes.steps),
+        "named": any(step.name == row.name for step in answer.steps),
         "cosines": [{"mechanism": name, "cosine": cosine} for cosine, name in sorted(alike, reverse=True)[:6]],
     }
 

@@ -26,7 +26,7 @@ def channels_of(answer: Answer) -> tuple[str, ...]:
 
 def law_record(answer: Answer) -> dict[str, Any] | None:
     """The law that was found, whether it holds or not; None without a law."""
-    described = answer.causes.described
+    described = answer.described
     if described is None or described.last is None:
         return None
     gain, names = described.gain, channels_of(answer)
@@ -58,7 +58,7 @@ def law_record(answer: Answer) -> dict[str, Any] | None:
 
 def ports_record(answer: Answer) -> dict[str, Any] | None:
     """Every port with its evidence; None if not requested."""
-    described = answer.causes.described
+    described = answer.described
     if described is None:
         return None
     return {
@@ -161,7 +161,7 @@ def _ties(described: Described, names: Sequence[str]) -> str:
 
 def ports_sentence(answer: Answer) -> str:
     """Ports with an effect, in an audit without a supported law."""
-    described = answer.causes.described
+    described = answer.described
     if described is None or described.holds:
         return ""
     rows = described.search.significant(answer.problem.rules.family)
@@ -180,7 +180,7 @@ def ports_sentence(answer: Answer) -> str:
 
 def _no_law(answer: Answer) -> str:
     """Statement that no law is supported; for a law of the fitted recordings, its errors on unseen recordings."""
-    described = answer.causes.described
+    described = answer.described
     assert described is not None
     if described.last is None or described.gain is None:
         return "no law of it holds"

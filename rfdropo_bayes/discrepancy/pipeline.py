@@ -82,25 +82,6 @@ class Results:
 
 
 @dataclass(frozen=True)
-class Causes:
-    """Result of the search over extensions.
-
-    Attributes:
-        steps: steps supported by unseen recordings; all steps if none is supported.
-        unsupported: mechanisms supported by fitted but not by unseen recordings.
-        test_series: score tests of the base model, and after each step.
-        refits: log Bayes factors of candidates refitted beside the last model but not added.
-        described: effect that the library lacks; None if no misfit was left.
-    """
-
-    steps: list[Added]
-    unsupported: list[str]
-    test_series: list[ScoreTests]
-    refits: dict[str, float] = field(default_factory=dict)
-    described: Described | None = None
-
-
-@dataclass(frozen=True)
 class Validation:
     """Gain of the extension on recordings that no fit has seen.
 
@@ -142,24 +123,6 @@ class Validation:
 
 
 @dataclass(frozen=True)
-class Doubts:
-    """Doubts about the noise or the simulation.
-
-    Attributes:
-        suspected: a noise under which the base model would pass, if the stated noise leaves an unexplained discrepancy.
-        shift: constant distance between repeats [m]; None without repeats.
-        numerical: motion of the last model's markers by half the time step and a finer mesh [m]; None if unknown, or if
-            the finer simulator is used.
-        priors: parameters of the base model determined by their prior.
-    """
-
-    suspected: Stacked | None
-    shift: float | None
-    numerical: float | None
-    priors: list[Caution]
-
-
-@dataclass(frozen=True)
 class Cost:
     """Cost of an audit.
 
@@ -192,21 +155,38 @@ class Answer:
         problem: the audited problem.
         target: data, noise of the measurement, and simulator.
         base: fit of the base model.
-        causes, validation, doubts, cost: see their own classes.
+        steps: steps supported by unseen recordings; all steps if none is supported.
+        unsupported: mechanisms supported by fitted but not by unseen recordings.
+        test_series: score tests of the base model, and after each step.
+        refits: log Bayes factors of candidates refitted beside the last model but not added.
+        described: effect that the library lacks; None if no misfit was left.
+        validation, cost: see their own classes.
         remainder: the residual that no candidate explains.
         sizes: the last model's fit under widened priors; the source of ``draws``.
+        suspected: a noise under which the base model would pass, if the stated noise leaves an unexplained discrepancy.
+        shift: constant distance between repeats [m]; None without repeats.
+        numerical: motion of the last model's markers by half the time step and a finer mesh [m]; None if unknown, or if
+            the finer simulator is used.
+        priors: cautions on parameters of the base model determined by their prior.
     """
 
     verdict: str
     problem: AuditProblem
     target: FitTarget
     base: Fit
-    causes: Causes
+    steps: list[Added]
+    unsupported: list[str]
+    test_series: list[ScoreTests]
+    refits: dict[str, float]
+    described: Described | None
     validation: Validation
     remainder: Remainder
     sizes: Fit
     draws: Float[np.ndarray, "draw d"]
-    doubts: Doubts
+    suspected: Stacked | None
+    shift: float | None
+    numerical: float | None
+    priors: list[Caution]
     cost: Cost
 
     @property
@@ -222,13 +202,12 @@ class Answer:
     @property
     def extended(self) -> Fit:
         """The last model."""
-        return self.causes.steps[-1].fit if self.causes.steps else self.base
+        return self.steps[-1].fit if self.steps else self.base
 
     @property
     def law(self) -> Described | None:
         """The adopted law; None without an adopted law."""
-        described = self.causes.described
-        return described if described is not None and described.holds else None
+        return self.described if self.described is not None and self.described.holds else None
 
     @property
     def adopted(self) -> list[Added]:
@@ -236,7 +215,7 @@ class Answer:
         gain = self.validation.gain
         if self.law is not None:
             gain = self.validation.gain or self.law.gain
-        return self.causes.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
+        return self.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
 
 
 def audit(
@@ -352,22 +331,27 @@ def conclude(results: Results, report: Callable[[str], None] = lambda line: None
         size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
         verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
     draws = sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds)
-    suspected = None if verdict == DESCRIBED else results.suspected
     rollouts = fit_target.forward.rollouts + (finer.rollouts if finer else 0)
+    why, unfinished = (clock.why, results.unfinished) if stopped else ("", ())
     return Answer(
         verdict,
         problem,
         target,
         base,
-        Causes(steps, list(kept.unsupported), test_series, fitted.gains, described),
+        steps,
+        list(kept.unsupported),
+        test_series,
+        fitted.gains,
+        described,
         validation,
         remainder,
         sizes,
         draws,
-        Doubts(suspected, target.measurements.shift, shown, decided_by_priors(target, draws)),
-        Cost(
-            clock.why if stopped else "", results.unfinished if stopped else (), rollouts, clock.profile, clock.waited
-        ),
+        suspected=None if verdict == DESCRIBED else results.suspected,
+        shift=target.measurements.shift,
+        numerical=shown,
+        priors=decided_by_priors(target, draws),
+        cost=Cost(why, unfinished, rollouts, clock.profile, clock.waited),
     )
 
 

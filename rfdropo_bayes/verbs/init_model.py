@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import DataSpec, load_recordings
-from rfdropo_bayes.data.named_columns import ROWS
+from rfdropo_bayes.data.named_columns import METRES, ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.experiment import load_experiment
@@ -21,7 +21,7 @@ from rfdropo_bayes.verbs.column_names import Guess
 from rfdropo_bayes.verbs.column_units import ANGLES
 from rfdropo_bayes.verbs.init import data_tables, quoted, with_given
 
-OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ANGLES}  # units of commands in recordings, for each unit of a simulator
+OF_CABLE = {"m": tuple(METRES), "rad": ANGLES}  # units of commands in recordings, for each unit of a simulator
 
 
 def write_model_experiment(
@@ -80,7 +80,7 @@ def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> d
         "markers": guess.markers,
     }
     columns |= {} if guess.counts_per_turn is None else {"counts_per_turn": guess.counts_per_turn}
-    columns |= {"units": dict(guess.units), "names": guess.names}
+    columns |= {"units": dict(guess.units), "names": guess.names, "command_names": guess.command_names}
     if guess.sample_time is None:
         columns |= {"time": guess.time or ROWS, "time_unit": guess.time_unit}
     else:

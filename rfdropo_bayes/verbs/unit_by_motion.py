@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.verbs.column_units import Unit
+from rfdropo_bayes.verbs.column_units import ANGLES, METRIC, Unit
 from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, Size
 
 MOST_TURN = np.pi  # largest turn of a body [rad] by its cables
@@ -89,7 +89,8 @@ def unit_of_motion(
     if measured == 0.0:
         return guessed
     for name, (other, own) in COMMAND_UNITS.items():
-        driven = driven_motion(robot, own * command, list(heights.values())) if other == kind else None
+        tried = other == kind and name in (*METRIC, *ANGLES, guessed.unit)
+        driven = driven_motion(robot, own * command, list(heights.values())) if tried else None
         if driven is not None:
             moved[name] = Size(measured, spread(driven))
     explaining = [name for name in moved if moved[name].within(EXPLAINED)]

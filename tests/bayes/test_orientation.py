@@ -71,10 +71,10 @@ def test_columns_may_hold_quaternions_or_rotation_vectors():
     vector = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 20.0, 0.0]])
     quaternion = Rotation.from_rotvec(vector, degrees=True).as_quat()
     frame = pd.DataFrame({"t": [0.0, 0.1, 0.2], "u": [0.0, 1.0, 2.0], "x": 0.0, "y": 0.0, "z": [0.2, 0.19, 0.18]})
-    frame[["vx", "vy", "vz"]], frame[["qx", "qy", "qz", "qw"]] = np.deg2rad(vector), quaternion
+    frame[["vx", "vy", "vz"]], frame[["qx", "qy", "qz", "qw"]] = vector, quaternion
     frame.loc[2, "qx"] = np.nan
     columns = {"time": "t", "commands": ["u"], "command_unit": "mm", "positions": [["x", "z", "y"]]}
-    columns |= {"position_unit": "m", "axes": ("x", "-z", "y"), "sections": ["one", "two"]}
+    columns |= {"position_unit": "m", "axes": ("x", "-z", "y"), "rotation_unit": "deg", "sections": ["one", "two"]}
     columns["orientations"] = [["vx", "vy", "vz"], ["qx", "qy", "qz", "qw"]]
     found = rb.Trajectory.from_pandas(frame, columns)
     assert found.section_names == ("one", "two")
