@@ -428,8 +428,9 @@ class LawSearch:
                 for k in np.flatnonzero((gains[:, 0] > null_quantile) & (share >= LEAST)).tolist():
                     parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                     row = TermGain(port, features[k], float(gains[k, 0]), float(share[k]), *parts, scope)
-                    known = coefficient_name(port, features[k], self.units[0], scope.group) in self.taken
-                    if not known and not had & {row.place, _of_any_shape(row.place)}:
+                    if had & {row.place, _of_any_shape(row.place)}:
+                        continue
+                    if not self.taken or coefficient_name(*row.place[:2], self.units[0], scope.group) not in self.taken:
                         rows.append(row)
         return sorted(rows, key=lambda row: -row.gain)
 
