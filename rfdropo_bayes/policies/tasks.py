@@ -108,7 +108,7 @@ def reward(
     return (beginning - potential(distance)) / beginning - 0.05
 
 
-MOVING = 0.05
+MOVING = 0.5
 """Part of an action's reward that a policy loses if it moves every cable by the largest step.
 
 A command is carried out over the robot's ramp. Ramps longer than the control period overlap: commands that alternate
