@@ -124,7 +124,8 @@ class Homing:
     def _search(self, loop: ControlLoop, index: int, tension: float, below: bool) -> Home:
         """Let a cable out until it is below a tension, or pull it until it is above."""
         motor, drive, name = loop.motors[index], loop.drives.all[index], loop.drives.all[index].name
-        end = time.monotonic() + self._table.time_s
+        longest = 2.0 * self._table.travel_m / self._table.rate_m_s
+        end = time.monotonic() + longest
         recent: list[float] = []
         step = self._table.rate_m_s * loop.period * (-1.0 if below else 1.0)
         goal = loop.set_points.length.copy()
@@ -136,7 +137,7 @@ class Homing:
             if below and goal[index] <= motor.length_limit_m[0] + 1e-9:
                 break  # slack enough: it may hang loose further than the cap lets it out
             if time.monotonic() > end:
-                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {self._table.time_s:g} s")
+                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {longest:g} s")
             goal[index] += step
             if goal[index] > motor.length_limit_m[1]:
                 way = 1e3 * self._table.travel_m

@@ -263,7 +263,7 @@ class _Session:
             self.robot, self.drives, markers, self.log, safety, self.period, lambda text: self.log.event("stop", text)
         )
         if safety.button_file is not None:
-            hooks = (*hooks, file_hook(Path(safety.button_file), safety.button_pressed))
+            hooks = (*hooks, file_hook(Path(safety.button_file)))
 
         def press(what: str, silence: bool) -> None:
             loop.demanded = Stop(Cause.DEADLINES if silence else Cause.EMERGENCY_STOP, what)

@@ -21,16 +21,9 @@ from jaxtyping import Float
 from rfdropo_bayes.discrepancy.deadline import OutOfTime
 from rfdropo_bayes.discrepancy.differences import Groups
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
-from rfdropo_bayes.discrepancy.inadequacy import noise_updated
+from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.port_evidence import PortEvidence, evidences
-from rfdropo_bayes.discrepancy.port_responses import (
-    Responses,
-    feature_columns,
-    responses,
-    signal_sizes,
-    under,
-    with_exact_columns,
-)
+from rfdropo_bayes.discrepancy.port_responses import Responses, feature_columns, responses, under, with_exact_columns
 from rfdropo_bayes.discrepancy.port_rollouts import (
     EVERYWHERE,
     PREFIX,
@@ -351,14 +344,18 @@ class LawSearch:
                     break
                 ties = law.ties if terms else _tied(best, others)
                 best = self._shaped(known, terms, best)
-                fit_target, fit = noise_updated(best.target, best.fit)
+                fit_target, fit = best.target, best.fit
+                if fit_target.known is not None:  # misspecified so far: under noise of the present residuals
+                    fit_target, fit = fit_with_noise(fit_target.known, fit.x, fit.free)
                 anew = fit_target is not best.target
                 best = replace(best, target=fit_target, fit=fit)
                 linear, known = under(linear, known, fit_target), fit_target.on(target.forward)
                 linear = _relinearised(known, linear, fit)
                 null = self._null(known, fit, linear)
                 where = evidences(linear, null)
-                self._say(best, where[0])
+                law_words = f"{best.term.port.words}: {best.feature.formula(self.units[0])}{in_words(best.term.scope)}"
+                rest = f"{where[0].port.words} {where[0].log_evidence:.1f} nats"
+                self.report(f"law at {law_words}, score {best.score:.1f}; then {rest}")
                 if anew and not terms:
                     ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
                 law = replace(law, terms=[*terms, best], ties=ties, afterwards=[*law.afterwards, where[0]])
@@ -399,13 +396,8 @@ class LawSearch:
         place = {feature: k for k, feature in enumerate((*self.table.features, *self.table.of_motion))}
         own = [[place[f.of(m.number)] for m in self.ports.members(port)] for f in self._features(port)]
         signals = values[:, np.array(own)]
-        sizes = signal_sizes(signals)
+        sizes = np.sqrt(np.mean(signals**2, axis=(0, 2, 3)))  # root mean squares over all recordings
         return sizes, signals / np.maximum(sizes, 1e-300)[:, None, None]
-
-    def _say(self, best: Refit, where: PortEvidence) -> None:
-        names = self.units[0]
-        law = f"{best.term.port.words}: {best.feature.formula(names)}{in_words(best.term.scope)}"
-        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
     def _null(self, known: FitTarget, fit: Fit, linear: Responses) -> Float[np.ndarray, "draw n"]:
         """Whitened residuals of simulated data sets that lack nothing."""
@@ -475,7 +467,9 @@ class LawSearch:
             residual = best.target.residual(without[None])[0]
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
-            model = LinearModel(known, terms, bare, _relinearised(known, linear, bare), _precision(known, bare))
+            scale = _scale(known, bare)
+            precision = np.linalg.inv(bare.covariance / np.outer(scale, scale))  # of the posterior, in prior deviations
+            model = LinearModel(known, terms, bare, _relinearised(known, linear, bare), precision)
             ranked = self._ranked(model.responses, values, null_quantile, model.precision, terms)
             ranked = [row for row in ranked if row.place not in tried]
             fresh = self._confirmed(model, ranked, null_quantile, partial(fresh_terms, best=best.term, where=where))
@@ -640,12 +634,6 @@ def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:
     """Prior deviations of a fit's parameters; coefficients of laws have their own as a unit."""
     base = fit.free < len(known.forward.coordinates.names)
     return np.append(known.forward.coordinates.prior_sd[fit.free[base]], np.ones(np.count_nonzero(~base)))
-
-
-def _precision(known: FitTarget, fit: Fit) -> Float[np.ndarray, "free free"]:
-    """Posterior precision of a fit's parameters, in deviations of their priors."""
-    scale = _scale(known, fit)
-    return np.linalg.inv(fit.covariance / np.outer(scale, scale))
 
 
 def _relinearised(known: FitTarget, linear: Responses, fit: Fit) -> Responses:

@@ -65,17 +65,14 @@ class Decomposed:
         return 0.5 * (square / variance) @ c - 0.5 * np.sum(np.log(variance), axis=1)[:, None]
 
 
-def evidences(
-    linear: Responses, null: Float[np.ndarray, "draw n"], chosen: Sequence[Port] | None = None
-) -> list[PortEvidence]:
+def evidences(linear: Responses, null: Float[np.ndarray, "draw n"]) -> list[PortEvidence]:
     """Evidence of every port, the largest first.
 
     Args:
-        found: responses of the model.
+        linear: responses of the model.
         null: whitened residuals of simulated data sets without discrepancy.
-        chosen: ports to test; all by default.
     """
-    base, ports = linear.base, list(linear.whitened) if chosen is None else list(chosen)
+    base, ports = linear.base, list(linear.whitened)
     residual = project_out(base, linear.residual.reshape(-1)[:, None])[:, 0]
     data = np.concatenate([residual[:, None], null.T[: len(residual)]], axis=1)
     kernels = [np.exp(-np.abs(np.subtract.outer(linear.basis.centre, linear.basis.centre)) / m) for m in MEMORIES]

@@ -22,7 +22,7 @@ from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APA
 from rfdropo_bayes.discrepancy.fit import Fit, best_between, heights, optimise
 from rfdropo_bayes.discrepancy.inadequacy import misspecified
 from rfdropo_bayes.discrepancy.score import joint_statistic
-from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
+from rfdropo_bayes.discrepancy.score_tests import ScoreTests
 
 PAIRS = 3  # that are refitted
 
@@ -56,7 +56,11 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
     leading = sorted((p for p in drops if drops[p] > taken + 2.0 * worth), key=lambda p: -drops[p])[:PAIRS]
     fits = {}
     for names in leading:
-        fits[names] = _refit_pair(search, fit, [rows[name] for name in names])
+        probes = [probe for name in names if (probe := rows[name].probe)]
+        constant = [index for probe in probes for index in probe.point]
+        added = np.concatenate([c.indices for c in search.candidates if c.name in names])
+        start = best_between(target, fit.x, start_together(fit, probes), constant, SHARES)
+        fits[names] = optimise(target, start, np.array([*fit.free, *np.setdiff1d(added, fit.free)]))
         gained = fits[names].log_evidence - fit.log_evidence
         search.report(f"refit with {' and '.join(names)}: log Bayes factor {gained:.1f}")
     if not fits:
@@ -73,15 +77,6 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         Added(first, (first,), tests, alone[first], gains[0], single.refits if single else {}, target),
         Added(second, (second,), between, fits[best], gains[1], {}, target),
     ]
-
-
-def _refit_pair(search: ExtensionSearch, fit: Fit, rows: Sequence[ScoreRow]) -> Fit:
-    """The model of a fit with two candidates in it."""
-    probes = [row.probe for row in rows if row.probe is not None]
-    chosen = [c.indices for c in search.candidates if c.name in [row.name for row in rows]]
-    constant = [index for probe in probes for index in probe.point]
-    start = best_between(search.target, fit.x, start_together(fit, probes), constant, SHARES)
-    return optimise(search.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
 
 
 def optimised_again(search: ExtensionSearch, step: Added) -> Fit | None:

@@ -122,12 +122,8 @@ def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarr
     probe = seen[best]
     lm = float(statistic(probe.mark, fit.residual)[0])
     score = lm - probe.mark.rank * np.log(fit.counted)
-    return ScoreRow(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
-
-
-def _p_value(surprise: float) -> float:
-    """Never zero, which no p-value is: the smallest number that is left."""
-    return max(float(np.exp(-surprise)), float(np.finfo(float).tiny))
+    p = max(float(np.exp(-surprises[best])), float(np.finfo(float).tiny))  # no p-value is zero
+    return ScoreRow(name, probe, lm, probe.mark.rank, p, tail(surprises[best], most), score)
 
 
 def _statistics(

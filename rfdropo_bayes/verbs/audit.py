@@ -256,6 +256,7 @@ def build_problem(
         commands = stack_commands([commands_of(whole, trajectory) for trajectory in trajectories])
         return lanes(finer, whole), commands
 
+    matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
     return AuditProblem(
         lanes(spec, simulator),
         None if isinstance(robot, BlackBox) else half(robot),
@@ -265,7 +266,7 @@ def build_problem(
         candidates,
         _stated(spec, model, fitted[0]),
         start,
-        _rules(table),
+        Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters),
         seed,
         {name: why for name, why in left_out.items() if name not in table.exclude},
         groups,
@@ -290,12 +291,6 @@ def _something_asked(table: AuditTable, groups: Groups | None) -> None:
             where="[audit] library",
             remedy="set library = true, or ports = true without --between",
         )
-
-
-def _rules(table: AuditTable) -> Rules:
-    """The rules of an audit from its table [audit]."""
-    matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
-    return Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters)
 
 
 def _named(

@@ -27,7 +27,7 @@ rod is of second order.
 LONGEST, LONGEST_MESH = 20.0, 2.0
 """Longest simulated part of a recording [s], of a rod and of tetrahedra, whose steps take 100 times as long."""
 SOLVES = 4.0  # linear solves that a row of a quasi-static motion takes on average, at most
-ENOUGH = 0.01
+ENOUGH = 0.02
 """Share of the markers' way by which a quasi-static motion may differ from a dynamic one and still be enough."""
 
 

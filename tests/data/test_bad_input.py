@@ -184,7 +184,7 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
         ({"format": "csv", "columns": COLUMNS | {"tme": "t"}}, "unknown key 'columns.tme'; did you mean 'time'"),
         (
             {"format": "csv", "columns": COLUMNS | {"position_unit": "metre"}},
-            "position_unit = 'metre': Input should be 'm', 'cm' or 'mm'",
+            "position_unit = 'metre': Input should be 'm', 'cm', 'mm' or 'in'",
         ),
         ({"format": "csv", "columns": COLUMNS | {"axes": ["x", "z", "-z"]}}, "x, y and z once each"),
         ({"format": "csv", "columns": COLUMNS | {"time": "t"}}, "either time"),
@@ -251,12 +251,28 @@ def test_decimal_commas_between_commas_are_explained(tmp_path):
         plain(tmp_path / "own.csv", "x;y;z;u\n100,5;0;0;1,5\n1.005,5;0;0;1,5\n100;0;0;1\n")
 
 
-def test_lines_above_the_names_of_the_columns_are_named(tmp_path):
-    """Loggers say there when they began; the row below the names is not at fault."""
-    with fails("the names of its 4 columns stand in line 3, below other lines; leave out the lines above them"):
-        plain(tmp_path / "own.csv", "# logger 3.1\n# begun at noon\n" + ROWS)
+@pytest.mark.parametrize(
+    "above",
+    [
+        "# logger 3.1\n# begun at noon\n",
+        "logger 3.1\n\nbegun;at noon\n",
+        "# rate, 100, Hz, nominal\n",  # as many cells as columns
+        "# ",  # in front of the names
+    ],
+)
+def test_lines_above_the_names_of_the_columns_are_left_out(tmp_path, above):
+    """Loggers say there when they began."""
+    found, bare = plain(tmp_path / "own.csv", above + ROWS), plain(tmp_path / "bare.csv", ROWS)
+    np.testing.assert_array_equal(found.position, bare.position)
+    assert found.cable_names == bare.cable_names
+
+
+def test_rows_of_another_width_are_refused(tmp_path):
     with fails("row 0: has 5 values, but the header names 4"):
         plain(tmp_path / "own.csv", "x,y,z,u\n" + ROWS.removeprefix("x,y,z,u\n").replace("\n", ",\n"))
+    longer = "".join(f"{row},0\n" for row in ROWS.splitlines()[1:])
+    with fails("row 3: has 5 values, but the header names 4"):  # a second table below the first
+        plain(tmp_path / "own.csv", ROWS + "x,y,z,u,v\n" + longer)
 
 
 def test_a_clock_that_is_written_in_no_known_way_is_not_one_cell_to_correct(tmp_path):

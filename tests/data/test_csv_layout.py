@@ -46,7 +46,7 @@ def test_a_file_without_names_shows_its_first_rows_and_asks_for_names(tmp_path):
         read(tmp_path / "run.csv", text(head=""))
     with pytest.raises(InputError, match="has 5 columns, and names has 4"):
         read(tmp_path / "run.csv", text(head=""), names=NAMES[1:])
-    with pytest.raises(InputError, match="begin in line 3, and no line names them"):
+    with pytest.raises(InputError, match="the first line holds values, not the names of its 5 columns: row 0: 0"):
         read(tmp_path / "run.csv", text(head="# logger 3\n# noon"))
 
 

@@ -78,6 +78,16 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.unused == ["battery"]
 
 
+@pytest.mark.parametrize(("names", "unit"), [("F_{0}", "N"), ("tension{0}", "N"), ("enc{0}_counts", "counts")])
+def test_measured_forces_and_angles_stand_for_commands_that_nobody_recorded(tmp_path, names, unit):
+    run = table("t", "{marker}_{axis}", names)
+    run["battery_V"] = 12.0
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.commands, guess.command_unit) == ([names.format(k) for k in range(1, 5)], unit)
+    assert (guess.tensions, guess.motor_angles) == ([], [])
+
+
 def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(tmp_path):
     run = table("Zeit [ms]", "{marker}_{axis}", "motor{0}", factor=1e3)
     run.insert(0, "latency [ms]", 3.0)
@@ -319,6 +329,21 @@ def test_a_file_without_names_is_read_by_the_names_that_init_suggests(tmp_path, 
     (read,) = load_recordings(experiment.data, tmp_path / "arm")
     np.testing.assert_allclose(read.command, 1e-3 * run[[f"u{k}" for k in range(1, 5)]])
     assert read.marker_names == ("low", "tip")
+
+
+def test_positions_and_commands_may_be_two_files_without_names(tmp_path, monkeypatch, capsys):
+    run = table("t", "{marker}_{axis}", "u{0}")
+    sent = [name for name in run if name.startswith("u")]
+    run.drop(columns=sent).to_csv(tmp_path / "run.csv", index=False, header=False)
+    run[["t", *sent]].to_csv(tmp_path / "sent.csv", index=False, header=False)
+    monkeypatch.chdir(tmp_path)
+    words = ["--recording", "run.csv", "--commands", "sent.csv", "--length-mm", "200", "--cables", "4"]
+    words += ["--markers", "low=100,tip=200", "--names", ",".join(name for name in run if name not in sent)]
+    status, told = init(monkeypatch, capsys, "arm", *words, "--command-names", ",".join(["t", *sent]))
+    assert status == 0, told
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (read,) = load_recordings(experiment.data, tmp_path / "arm")
+    np.testing.assert_allclose(read.command, 1e-3 * run[sent])
 
 
 @pytest.mark.parametrize(
