@@ -6,6 +6,10 @@ large force along the axis (Magisano, Leonetti and Garcea 2017, "How to improve 
 method in geometrically non-linear structural problem discretized via displacement-based finite elements"). Increments
 that shrink slowly are prolonged by Aitken's rule. Mobilised friction of the cables continues from the
 previous state, so that it depends on the path. Derivatives are of the equations at the solution, with all terms.
+
+Moments turn with the sections only if the body has cables, which balance the moments of the sections. Another moment
+is of a load. A moment that is fixed in space has no symmetric tangent, and the tangent's symmetric part has no factor
+as soon as the moment bends the body by more than half a turn.
 """
 
 from __future__ import annotations
@@ -172,6 +176,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
     none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)
+    turns = jnp.asarray([[1.0]] * 3 + [[float(cables > 0)]] * 3)
 
     def one(current: _Iterate) -> _Iterate:
         bonds = _bonds(system, task, current.place, current.impulse[:cables])
@@ -189,7 +194,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
         share = jnp.where(paced, jnp.minimum(limit, _pace(current, increment)), plain)
         remaining = jnp.where(grown | ~jnp.isfinite(current.largest), size, size**2 / (current.largest - size))
         remaining = jnp.where(share > 1.0, share * size, remaining)
-        turning = current.turning + share * (stresses(body, solution.change) - current.turning)
+        turning = current.turning + share * (turns * stresses(body, solution.change) - current.turning)
         shift = jnp.where(size > CALM, EASED, 1.0) * current.shift
         pace = jnp.where(shift < current.shift, 0.0, share)
         place = displaced(current.place, share * solution.change.T)
@@ -201,7 +206,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
 
     runs = 0 if task.slip is None else len(task.slip.strength)
     impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
-    turning, least = stresses(_body(system, task, task.start), none), _least_shift(system, task.prepared)
+    turning, least = turns * stresses(_body(system, task, task.start), none), _least_shift(system, task.prepared)
     rest = task.moves > 0.5, task.moves, jnp.zeros(()), jnp.zeros(cables)
     first = _Iterate(task.start, impulse, turning, none[0, 0], jnp.array(jnp.inf), none, none[0, 0], *rest)
     upright = state_at_rest(system)

@@ -119,7 +119,8 @@ def _choose_way(tables, work, moving, token):
 @kernel
 def _follow_stress(tables, samples, factors, work, share, token):
     """Let the stresses that turn in the matrix go a share of their way to those of the increment in ``velocity``,
-    without its second order: in a thin rod that order of a rotation is a large force along the axis.
+    without its second order: in a thin rod that order of a rotation is a large force along the axis. Moments turn only
+    on a body with cables, see `equilibrium`.
 
     As in Newton's method with independent stresses (Magisano, Leonetti and Garcea 2017, "How to improve efficiency and
     robustness of the Newton method in geometrically non-linear structural problem discretized via displacement-based
@@ -129,7 +130,7 @@ def _follow_stress(tables, samples, factors, work, share, token):
     for element in range(tables.stations - 1):
         measure_element(tables, samples, element, work, token)
         place_stress(tables, samples, factors, element, work, token)
-        for i in range(SIZE):
+        for i in range(SIZE if tables.cables > 0 else 3):
             row, there = SIZE * element + i, load(work.element, STRESS + i, token)
             before = load(work.stress, row, token)
             store(work.stress, row, where_greater(share, zero, fma(share, there - before, before), before))
