@@ -167,7 +167,7 @@ def fitted_paths(problem: AuditProblem, start: Mapping[str, float]) -> list[Path
     if "object_pose" in problem.lanes.fields:
         return []
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
-    values = problem.coordinates.nominal | start
+    values = {**problem.coordinates.nominal, **start}
     theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
     fields, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
     valid = np.asarray(recordings.line.valid)
