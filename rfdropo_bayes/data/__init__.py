@@ -7,7 +7,6 @@ from rfdropo_bayes.data.first_command import common_beginning
 from rfdropo_bayes.data.matching import check_channels, shared_markers
 from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
-from rfdropo_bayes.data.plain_csv import read_plain_csv
 from rfdropo_bayes.data.recorded import GOAL_AXES, Measured, Origin, SentCommands
 from rfdropo_bayes.data.repeats import command_openings, group_repeats, noise_floor, same_opening
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv

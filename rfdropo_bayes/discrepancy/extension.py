@@ -189,7 +189,13 @@ class ExtensionSearch:
                 return tests
             seen = tests.row(DISCRETISATION).adjusted_p <= self.rules.family
             if seen and self._below_the_noise(fit):
-                exact = _without_numerical_error(fit, probes[-1])
+                # The simulation without its error in space and time, estimated from two resolutions. The change by
+                # halving the steps is a part of the error: half at first order of the time steps, three quarters at
+                # second order of the mesh. The error is therefore one to two times the change, as the data have it.
+                base, halved = span(fit.jacobian), probes[-1].columns
+                moved, left = project_out(base, halved)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
+                times = np.clip(float(moved @ left) / max(float(moved @ moved), 1e-300), 1.0, 2.0)
+                exact = fit.residual - times * halved[:, 0]
                 again = run_score_tests(
                     self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact
                 )
@@ -297,15 +303,13 @@ class ExtensionSearch:
         chosen = [*heads, *rest][: self.rules.members]
         # A refit on a finer mesh costs as much as all others: only if it could win.
         chosen = [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
-        return sorted(chosen, key=lambda row: self._costly(row.name))
-
-    def _costly(self, name: str) -> bool:
-        """Whether rollouts with a candidate take longer than others."""
-        candidate = self.candidate(name)
-        if candidate is None:
-            return True
         costly, parameters = self.target.forward.lanes.costly, self.target.forward.coordinates.space.parameters
-        return any(parameters[index].physical in costly for index in candidate.indices)
+
+        def slow(row: ScoreRow) -> bool:
+            candidate = self.candidate(row.name)
+            return candidate is None or any(parameters[index].physical in costly for index in candidate.indices)
+
+        return sorted(chosen, key=slow)
 
     def refit(self, fit: Fit, row: ScoreRow) -> Fit:
         """The model of a fit with a candidate in it."""
@@ -386,15 +390,3 @@ def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None
     moved = target.forward.observe_one(fit.x)["position"] - seen["position"][0]
     measured = target.measurements.channels[0].valid
     return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))
-
-
-def _without_numerical_error(fit: Fit, probe: Probe) -> Float[np.ndarray, " n"]:
-    """Residuals of the simulation without its error in space and time, estimated from two resolutions.
-
-    The change by halving the steps is a part of the error: half at first order of the time steps, three quarters at
-    second order of the mesh. The error is therefore one to two times the change; the data determine the factor.
-    """
-    base = span(fit.jacobian)
-    change, residual = project_out(base, probe.columns)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
-    share = np.clip(float(change @ residual) / max(float(change @ change), 1e-300), 1.0, 2.0)
-    return fit.residual - share * probe.columns[:, 0]

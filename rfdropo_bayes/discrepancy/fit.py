@@ -402,7 +402,15 @@ def optimise(
         slope, _ = optimised.quadratic(u)
         slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
         promise = 0.5 * float(slope @ approximation.covariance @ slope) if np.isfinite(state.log_density) else np.inf
-        evidence = approximation.log_evidence + float(np.sum(inside)) + _over_sizes(target, residual)
+        evidence = approximation.log_evidence + float(np.sum(inside))
+        # Integrated over the size of a misspecified model's residuals; no change at the assumed size.
+        series = target.measurements.series(residual)
+        change = 0.0
+        for part, own in zip(target.noise.parts, target.measurements.columns, strict=True):
+            if part.source == MISFIT:
+                share = max(float(np.sum(series[..., own] ** 2)) / part.freedom, np.finfo(float).tiny)
+                change += 0.5 * part.freedom * (share - 1.0 - np.log(share))
+        evidence += change
         return {
             "x": posterior.place(u[None])[0],
             "free": np.asarray(free),
@@ -416,18 +424,6 @@ def optimise(
     stored = target.recall("optimise", [start, free, np.array(evaluations)], compute)
     numbers = {name: float(stored[name]) for name in ("log_evidence", "promise")}
     return Fit(**{**stored, **numbers})  # type: ignore[arg-type]
-
-
-def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
-    """Change of a log evidence [nat] by integrating over the size of a misspecified model's residuals; 0 at the assumed
-    size.
-    """
-    series, change = target.measurements.series(residual), 0.0
-    for part, own in zip(target.noise.parts, target.measurements.columns, strict=True):
-        if part.source == MISFIT:
-            share = max(float(np.sum(series[..., own] ** 2)) / part.freedom, np.finfo(float).tiny)
-            change += 0.5 * part.freedom * (share - 1.0 - np.log(share))
-    return change
 
 
 def optimisation_rollouts(target: FitTarget, parameters: int) -> int:

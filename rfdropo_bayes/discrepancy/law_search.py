@@ -319,7 +319,9 @@ class LawSearch:
         """
         known = target
         linear = responses(known, fit, self.ports, self.table, self.report)
-        values = self._values(linear)
+        values = self.table.over(linear.levels)  # of all features of the commands, then of the motion
+        if linear.of_motion is not None:
+            values = np.concatenate([values, linear.of_motion], axis=1)
         null = self._null(known, fit, linear)
         where = evidences(linear, null)
         centre = linear.basis.centre - linear.begun
@@ -374,15 +376,6 @@ class LawSearch:
         chosen = [p for p in self.ports.ports if p.stage == "sensing" or p in leading]
         return with_exact_columns(known, fit, linear, {port: self._offered(port, values)[1] for port in chosen})
 
-    def _values(self, linear: Responses) -> Float[np.ndarray, "group feature row"]:
-        """All features of the commands, then of the motion."""
-        values = self.table.over(linear.levels)
-        return values if linear.of_motion is None else np.concatenate([values, linear.of_motion], axis=1)
-
-    def _has(self, port: Port, feature: Feature, group: str) -> bool:
-        """Whether a law of the model has this term."""
-        return bool(self.taken) and coefficient_name(port, feature, self.units[0], group) in self.taken
-
     def _features(self, port: Port) -> Sequence[Feature]:
         """Features of a law at a port, which on a body include the motion."""
         if self.ports.members(port) != (port,):
@@ -435,7 +428,9 @@ class LawSearch:
                 for k in np.flatnonzero((gains[:, 0] > null_quantile) & (share >= LEAST)).tolist():
                     parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                     row = TermGain(port, features[k], float(gains[k, 0]), float(share[k]), *parts, scope)
-                    if not had & {row.place, _of_any_shape(row.place)} and not self._has(*row.place):
+                    if had & {row.place, _of_any_shape(row.place)}:
+                        continue
+                    if not self.taken or coefficient_name(*row.place[:2], self.units[0], scope.group) not in self.taken:
                         rows.append(row)
         return sorted(rows, key=lambda row: -row.gain)
 

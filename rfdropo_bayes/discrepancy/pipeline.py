@@ -286,7 +286,12 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
     verdict = _verdict(kept, problem, ended=True)
     passes = kept.named.test_series[-1].omnibus.p > problem.rules.extended_passes
     if verdict in (PARTLY, UNEXPLAINED) and not passes:
-        results = replace(results, suspected=_suspected(search, as_measured(last.search.target, last.base)))
+        stated = search.target.measured
+        if stated.noise.source == STATED:  # would the base model pass under a noise fitted to its residuals?
+            other, fit = under_residual_noise(stated, as_measured(last.search.target, last.base))
+            p = search.under(other).score_tests(fit).omnibus.p
+            passing = p > problem.rules.base_passes and not other.noise.doubtful
+            results = replace(results, suspected=other.noise if passing else None)
         yield results
     # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that
     # passes the joint test leaves nothing to describe, even if the explained fraction is uncertain.
@@ -425,14 +430,3 @@ def _noise_in_words(target: FitTarget, fit: Fit) -> str:
     )
     white = f"white noise of {size:.2g} mm, the size of its residuals"
     return f"{words}; it is misspecified: {white}; a row counts {share:.2g}"
-
-
-def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
-    """Noise fitted to the base model's residuals, if the model passes under it but not under the stated noise."""
-    known = search.target.measured
-    if known.noise.source != STATED:
-        return None
-    target, fit = under_residual_noise(known, base)
-    tests = search.under(target).score_tests(fit)
-    passes = tests.omnibus.p > search.rules.base_passes and not target.noise.doubtful
-    return target.noise if passes else None

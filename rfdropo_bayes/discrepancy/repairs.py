@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from rfdropo_bayes.discrepancy.candidates import start_together
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, WIDER, Added, ExtensionSearch
@@ -109,7 +108,10 @@ def without_needless(search: ExtensionSearch, base: Fit, steps: Sequence[Added])
         gone = np.setdiff1d(steps[index].fit.free, before.free)
         emptied = last.fit.x.copy()
         emptied[gone] = null[gone]
-        if _nats_to(last.fit, emptied, gone) > TOLD_APART:
+        place = [int(np.flatnonzero(last.fit.free == index)[0]) for index in gone]
+        apart = last.fit.x[gone] - emptied[gone]
+        covariance = last.fit.covariance[np.ix_(place, place)]
+        if 0.5 * float(apart @ np.linalg.solve(covariance, apart)) > TOLD_APART:  # the least loss [nat]
             continue
         if optimise(last.fit_target, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
             search.report(f"{steps[index].name} is no longer needed")
@@ -131,10 +133,3 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
         fit_targets.append(step.fit_target)
         kept.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
     return tuple(kept)
-
-
-def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:
-    """Least loss [nat] of a model with some coordinates fixed at a point, by the fit's normal approximation."""
-    place = [int(np.flatnonzero(fit.free == index)[0]) for index in moved]
-    apart = fit.x[moved] - point[moved]
-    return 0.5 * float(apart @ np.linalg.solve(fit.covariance[np.ix_(place, place)], apart))

@@ -84,7 +84,7 @@ def installed_priors(
     if robot.command_unit in UNSTATED:
         normal("command_gain_error", UNKNOWN, "force of a drive over that of the robot file, less 1")
     if "length" in assumed:
-        normal("camera_scale_error", UNKNOWN, "lengths over those of the robot file, less 1")
+        normal("camera_scale_error", UNKNOWN, "lengths over the robot file's lengths, less 1")
     if _pulled_by_section(robot):
         lines.append("cable_compliance = {}  # stretch of a cable over its tension")
         wide, words = (TURN, "which was not given") if "segment_azimuths" in assumed else (TILT, "over the drawing's")

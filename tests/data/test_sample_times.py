@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults, read_plain_csv
+from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
+from rfdropo_bayes.data.mapped_formats import read_mapped
 from rfdropo_bayes.data.sample_times import (
     check_times,
     clock_notes,
@@ -65,7 +66,7 @@ def test_dates_and_durations_are_seconds_from_the_first_row(kind, types, tmp_pat
     columns = {"time": "t", **COLUMNS}
     if types == "file":
         frame.to_csv(tmp_path / "run.csv", index=False)
-        found = read_plain_csv(tmp_path / "run.csv", CsvColumns(**columns))
+        found = read_mapped("csv", tmp_path / "run.csv", CsvColumns(**columns))
     else:
         found = Trajectory.from_pandas(frame.set_index("t") if types == "index" else frame, columns)
     np.testing.assert_allclose(found.time, TIME, atol=1e-9)
@@ -81,7 +82,7 @@ def test_whole_numbers_keep_every_digit_in_arrays_and_files(tmp_path):
     ticks = SINCE_1970 + 7 * np.arange(60)
     np.testing.assert_array_equal(np.rint(1e9 * seconds(ticks, "ns")), 7 * np.arange(60))
     table(ticks).to_csv(tmp_path / "run.csv", index=False)
-    found = read_plain_csv(tmp_path / "run.csv", CsvColumns(time="t", time_unit="ns", **COLUMNS))
+    found = read_mapped("csv", tmp_path / "run.csv", CsvColumns(time="t", time_unit="ns", **COLUMNS))
     np.testing.assert_array_equal(np.rint(1e9 * found.time), 7 * np.arange(60))
 
 

@@ -276,7 +276,7 @@ def test_what_a_term_brings_beside_a_model_is_told_by_rollouts_of_that_model():
     options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
     search = law_search(target, *options)
     given = responses(target, base, question.ports, search.table)
-    values = search._values(given)
+    values = search.table.over(given.levels)
     given = search._sharpened(target, base, given, values, found.ports)
     told = search._ranked(given, values, 0.0)[:3]
     seen = search._beside(LinearModel(target, [], base, given), told)
