@@ -20,6 +20,7 @@ from rfdropo_bayes.tables import parse_table
 
 _SLACK = 0.7  # of the homing tension: a cable is let out to here before it is pulled, so that all approach from below
 _MEDIAN = 5  # cycles: a torque is noisy, and one reading must not decide
+VALID_H = 24.0  # age above which a result is refused
 TORQUE_FACTOR = 2.0  # the torque limit as a multiple of the homing tension
 
 
@@ -63,7 +64,7 @@ class HomingResult(BaseModel):
             raise InputError(f"cannot be written ({error})", where=str(path), remedy="correct [homing] file") from None
 
 
-def load_homing(path: Path, robot: Robot, valid_h: float) -> HomingResult:
+def load_homing(path: Path, robot: Robot) -> HomingResult:
     """Read the result of a homing.
 
     Raises:
@@ -78,9 +79,9 @@ def load_homing(path: Path, robot: Robot, valid_h: float) -> HomingResult:
     if result.robot != robot.name or tuple(home.channel for home in result.homes) != robot.channel_names:
         raise InputError(f"belongs to robot {result.robot!r}, whose name or channels differ", where=where, remedy=again)
     age = datetime.datetime.now(datetime.UTC) - result.date
-    if age > datetime.timedelta(hours=valid_h):
+    if age > datetime.timedelta(hours=VALID_H):
         raise InputError(
-            f"is {age.total_seconds() / 3600:.1f} h old; the limit is {valid_h:g} h", where=where, remedy=again
+            f"is {age.total_seconds() / 3600:.1f} h old; the limit is {VALID_H:g} h", where=where, remedy=again
         )
     return result
 

@@ -166,7 +166,7 @@ class _Session:
         table = self.settings.homing
         if table.file is None or self.simulated or self.mode in (Mode.HOME, Mode.CHECK):
             return [float(motor.offset_counts) for motor in self.robot.motors]
-        result = load_homing(Path(table.file), self.robot, table.valid_h)
+        result = load_homing(Path(table.file), self.robot)
         self._facts["homed"] = result.date.isoformat()
         return [float(home.offset_counts) for home in result.homes]
 

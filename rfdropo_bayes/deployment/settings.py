@@ -134,14 +134,12 @@ class HomingTable(_Table):
         rate_m_s: cable speed of the search.
         travel_m: longest travel of each cable.
         rounds: number of passes over all cables: pulling a cable changes the others.
-        valid_h: age above which a result is refused.
     """
 
     file: str | None = None
     rate_m_s: float = Field(default=0.002, gt=0.0)
     travel_m: float = Field(default=0.03, gt=0.0)
     rounds: int = Field(default=2, ge=1)
-    valid_h: float = Field(default=24.0, gt=0.0)
 
 
 class SimulationSettings(_Table):
