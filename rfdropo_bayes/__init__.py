@@ -111,49 +111,7 @@ _HOMES = {
 _COMPUTING = ("inference.", "model.", "simulators.", "verbs.")
 """Rooms that make arrays of JAX when they are imported."""
 
-__all__ = [
-    "NUTS",
-    "RFDROPO",
-    "SMC",
-    "Audit",
-    "AuditOptions",
-    "BlackBox",
-    "Calibration",
-    "Caution",
-    "Code",
-    "Cone",
-    "Cylinder",
-    "Design",
-    "Disks",
-    "InputError",
-    "Laplace",
-    "Model",
-    "MuJoCo",
-    "Nested",
-    "Parameter",
-    "ParameterSpec",
-    "Prediction",
-    "Robot",
-    "TrainingOptions",
-    "Trajectory",
-    "Tube",
-    "__version__",
-    "adapt",
-    "audit",
-    "calibrate",
-    "check",
-    "deploy",
-    "design",
-    "evaluate",
-    "load",
-    "load_deployment",
-    "make_vec",
-    "predict",
-    "read",
-    "section_profile",
-    "simulate",
-    "train",
-]
+__all__ = ["__version__", *_HOMES]
 
 
 def __dir__() -> list[str]:

@@ -1,7 +1,8 @@
 """Count the definitions that a reader opens on the way from a question to its answer.
 
 A walk starts at a function and follows its calls within the rooms of the question; a call into another room is one hop
-and is not followed. A method counts if one class alone has its name. ``--list`` prints every hop.
+and is not followed. A method counts if one class alone has its name, in a module that the caller's module imports,
+directly or through others. ``--list`` prints every hop.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ class Package:
         self.nodes: dict[Place, ast.AST] = {}
         self.names: dict[str, dict[str, Place]] = {}
         self.methods: defaultdict[str, list[Place]] = defaultdict(list)
+        self.imports: defaultdict[str, set[str]] = defaultdict(set)
         for path in PACKAGE.rglob("*.py"):
             module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
             self._read(module, ast.parse(path.read_text()))
@@ -45,15 +47,29 @@ class Package:
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rfdropo_bayes."):
                 source = str(node.module).removeprefix("rfdropo_bayes.")
                 names |= {alias.asname or alias.name: (source, alias.name) for alias in node.names}
+                self.imports[module] |= {
+                    source,
+                    f"{source}.__init__",
+                    *(f"{source}.{alias.name}" for alias in node.names),
+                }
+
+    def reached(self, module: str) -> set[str]:
+        """Modules that a module imports, directly or through others, and itself."""
+        found, waiting = {module}, [module]
+        while waiting:
+            new = self.imports[waiting.pop()] - found
+            found |= new
+            waiting += new
+        return found
 
     def called(self, place: Place) -> set[Place]:
         """Places that a definition calls or uses; of a class its constructor alone."""
-        node, found = self.nodes[place], set[Place]()
+        node, found, reached = self.nodes[place], set[Place](), self.reached(place[0])
         for part in ast.walk(node) if isinstance(node, ast.FunctionDef) else []:
             if isinstance(part, ast.Name) and part.id in self.names[place[0]]:
                 found.add(self.names[place[0]][part.id])
             elif isinstance(part, ast.Attribute) and len(self.methods[part.attr]) == 1:
-                found |= set(self.methods[part.attr])
+                found |= {each for each in self.methods[part.attr] if each[0] in reached}
         return {each for each in found if each in self.nodes and each != place}
 
 

@@ -56,7 +56,6 @@ class Lanes:
         self,
         simulator: Simulator,
         marker_index: np.ndarray,
-        width: int = WIDTH,
         fields: Sequence[str] = ("position",),
         costly: Sequence[str] = (),
         physical: Sequence[str] | None = None,
@@ -64,7 +63,7 @@ class Lanes:
         self.simulator = simulator
         self.marker_index = marker_index
         backend = getattr(getattr(simulator, "engine", None), "backend", None)
-        self.width = width
+        self.width = WIDTH
         self.fields = tuple(fields)
         self.costly = tuple(costly)
         self._size: tuple[int, int] | None = None
@@ -199,7 +198,7 @@ class RoutedLanes(Lanes):
     """
 
     def __init__(self, fast: Lanes, slow: Lanes, null: Mapping[str, float]) -> None:
-        super().__init__(slow.simulator, slow.marker_index, slow.width, slow.fields, slow.costly)
+        super().__init__(slow.simulator, slow.marker_index, slow.fields, slow.costly)
         self.fast, self.slow = fast, slow
         self._kept = np.array([self.physical.index(name) for name in fast.physical])
         self._further = np.setdiff1d(np.arange(len(self.physical)), self._kept)

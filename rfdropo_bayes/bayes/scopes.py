@@ -19,6 +19,8 @@ from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 
 HALF_NORMAL_MEDIAN = 0.6745
 
+WHERE = "[model.priors]"
+
 
 @dataclass(frozen=True)
 class Scopes:
@@ -323,7 +325,6 @@ def build_scopes(
     pooled: Mapping[str, Pooled] | None = None,
     only_in: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
     fixed: Mapping[str, float] | None = None,
-    where: str = "[model.priors]",
 ) -> Scopes:
     """Combine specifications, prior tables and parameters of single recordings.
 
@@ -341,7 +342,7 @@ def build_scopes(
     """
     by_name = {spec.name: spec for spec in specs}
     pooled, only_in = pooled or {}, only_in or {}
-    check_names(list(priors) + list(per_recording) + list(pooled), specs, where=where)
+    check_names(list(priors) + list(per_recording) + list(pooled), specs, where=WHERE)
     for name in pooled:
         alone = name in per_recording
         if name not in priors or alone:
@@ -359,7 +360,7 @@ def build_scopes(
                     where="[model.per_recording]",
                     remedy=f"recordings: {', '.join(recordings)}",
                 )
-        first = InferredParameter.of(by_name[name], table, where=where)
+        first = InferredParameter.of(by_name[name], table, where=WHERE)
         if name not in per_recording and name not in only_in:
             parameters.append(first)
         parameters += [replace(first, scope=Scope(r), members=(r,)) for r in per_recording.get(name, ())]
@@ -370,5 +371,5 @@ def build_scopes(
             spread = [p for p in spread_of(by_name[name], pooled[name]) if p.name not in known]
             parameters += [*spread, *deviations(by_name[name], pooled[name])]
     if not parameters:
-        raise InputError("no parameter has a prior", where=where, remedy="give at least one")
+        raise InputError("no parameter has a prior", where=WHERE, remedy="give at least one")
     return Scopes(tuple(parameters), by_name, fixed or {})

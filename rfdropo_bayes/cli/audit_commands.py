@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes.cli.options import (
-    AsJson,
     ExperimentFile,
     OutFolder,
     Overrides,
@@ -18,7 +17,7 @@ from rfdropo_bayes.cli.options import (
     same_command,
     see_calibration,
 )
-from rfdropo_bayes.cli.terminal_summary import say, show_audit
+from rfdropo_bayes.cli.terminal_summary import show_audit
 from rfdropo_bayes.errors import Interrupted
 
 Fit = Annotated[
@@ -36,7 +35,6 @@ def audit(
     ] = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Name the effects that the simulator lacks. Writes audit.json, extended.toml and report.html."""
@@ -55,10 +53,10 @@ def audit(
         overwrite=overwrite,
         show=True,
     )
-    show_audit(result.content, folder, as_json=as_json)
+    show_audit(result.content, folder)
     if result.content["stopped"] == INTERRUPT:
         raise Interrupted(str(folder), "--resume")
-    if result.content["stopped"] and not as_json:
+    if result.content["stopped"]:
         minutes = 2.0 * result.content["minutes"]
         typer.echo(f"to go on: {same_command('rfdropo', '--resume', '--set', f'audit.minutes={minutes:g}')}")
 
@@ -68,7 +66,6 @@ def design(
     out: OutFolder = None,
     fit: Fit = None,
     overwrite: Overwrite = False,
-    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Propose commands that distinguish causes. Writes next_commands.csv and design.json."""
@@ -79,6 +76,4 @@ def design(
     from rfdropo_bayes.verbs.design import design as propose
 
     result = propose(Model.read(experiment, overrides), fit=fit, out=folder, overwrite=overwrite, show=True)
-    commands = folder / COMMANDS
-    content = {**result.content, "commands": str(commands)}
-    say(content, result.sentence, f"commands: {commands}", as_json=as_json)
+    typer.echo(f"{result.sentence}\ncommands: {folder / COMMANDS}")

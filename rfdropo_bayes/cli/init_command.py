@@ -13,13 +13,12 @@ from rfdropo_bayes.errors import InputError
 
 if TYPE_CHECKING:
     from rfdropo_bayes.robots.outline import RobotOutline
-    from rfdropo_bayes.verbs.column_names import Guess
 
 ANGLES = ("deg", "rad", "counts")
 PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
-UNITS = ("mm", "cm", "m", *ANGLES, *PASCALS, *FORCES)
-FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ")
+UNITS = ("mm", "cm", "m", "in", *ANGLES, *PASCALS, *FORCES)
+FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ", "unwrap = ", "[model.groups]")
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
@@ -72,7 +71,7 @@ class Questions:
         if given is not None or not guess.counts:
             return given
         if not self.ask:
-            remedy = "give --counts-per-turn: counts in one turn of the spool, gear included"
+            remedy = "give --counts-per-turn: counts in one turn of the spool, gear included; or --command-unit"
             raise InputError("holds commands or angles in counts", where="--recording", remedy=remedy)
         return typer.prompt("Counts in one turn of the spool, gear included", type=float)
 
@@ -118,8 +117,8 @@ Pairs = Annotated[bool | None, typer.Option(help="opposite cables share a motor"
 CommandUnit = Annotated[
     str | None,
     typer.Option(
-        help="mm, cm or m of cable; deg, rad or counts of a motor; N, N m, V, A or % of a drive; guessed from a "
-        "recording"
+        help="mm, cm, m or in of cable; deg, rad or counts of a motor; N, N m, V, A or % of a drive; kPa, bar, psi, "
+        "... of chambers; guessed from a recording"
     ),
 ]
 CountsPerTurn = Annotated[
@@ -134,7 +133,7 @@ CommandNames = Annotated[str | None, typer.Option("--command-names", help="the s
 SampleTime = Annotated[
     float | None, typer.Option("--sample-time", help="seconds from row to row, if no column holds times")
 ]
-PositionUnit = Annotated[str | None, typer.Option(help="mm, cm or m; guessed from a recording")]
+PositionUnit = Annotated[str | None, typer.Option(help="mm, cm, m or in; guessed from a recording")]
 SpoolRadius = Annotated[float | None, typer.Option("--spool-radius-mm", help="radius of the motors' spools [mm]")]
 Gravity = Annotated[
     str | None,
@@ -186,6 +185,7 @@ def init(
     defaults: Defaults = False,
 ) -> None:
     """Write a first robot file and experiment file. Asks for facts that are neither in options nor in recordings."""
+    from rfdropo_bayes.verbs.column_names import guess_columns
     from rfdropo_bayes.verbs.init import (
         assumed_of_columns,
         matching_commands,
@@ -193,6 +193,7 @@ def init(
         of_robot,
         with_counts,
         with_given,
+        with_turns,
         write_first_files,
     )
 
@@ -202,9 +203,9 @@ def init(
     guess = None
     if files:
         columns = ask.names(files[0], names, None if cables is None else cables * (segments or 1), markers)
-        guess = _columns(files[0], sent, columns, command_names)
+        guess = guess_columns(files[0], sent[0] if sent else None, columns, _listed(command_names))
         guess = with_given(guess, command_unit=command_unit, position_unit=position_unit, sample_time=sample_time)
-        guess = with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None)
+        guess = with_turns(with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None))
     if folder.suffix in MODELS:
         _init_model(folder, files, sent, guess)
         return
@@ -228,7 +229,7 @@ def init(
     answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0 for silicone", 0.0) or None
     answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
     answers["markers"] = _markers(ask, guess, markers, answers["length"])
-    outline = _outline(_name(folder), disks, unit, answers, ask.assumed)
+    outline = _outline(_name(folder.resolve().name, "robot"), disks, unit, answers, ask.assumed)
     guess = None if guess is None else of_robot(guess, outline)
     robot, experiment = write_first_files(folder, outline, files, sent, guess)
     typer.echo(f"wrote {robot}\nwrote {experiment}")
@@ -244,13 +245,6 @@ def _found_lines(robot: Path, experiment: Path) -> list[str]:
     lines = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
     lines += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
     return [line for line in lines if "ASSUMED" in line]
-
-
-def _columns(file: Path, sent: list[Path], names: list[str] | None, command_names: str | None) -> Guess:
-    """Guessed meaning of the columns of the first recording."""
-    from rfdropo_bayes.verbs.column_names import guess_columns
-
-    return guess_columns(file, sent[0] if sent else None, names, _listed(command_names))
 
 
 def _listed(names: str | None) -> list[str] | None:
@@ -315,10 +309,10 @@ def _lengths(text: str | None) -> tuple[float, ...] | None:
         raise InputError(f"{text!r} is not a list of lengths", where=where, remedy='e.g. "60,62.5,64"') from None
 
 
-def _name(folder: Path) -> str:
-    """A robot's name from the name of a folder."""
-    letters = "".join(c if c.isascii() and c.isalnum() else "_" for c in folder.resolve().name.lower()).strip("_")
-    return letters if letters[:1].isalpha() else f"robot_{letters}".rstrip("_")
+def _name(text: str, kind: str) -> str:
+    """A name for robot files, of lower-case letters, digits and underscores, from any text."""
+    letters = "".join(c if c.isascii() and c.isalnum() else "_" for c in text.lower()).strip("_")
+    return letters if letters[:1].isalpha() else f"{kind}_{letters}".rstrip("_")
 
 
 def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: bool | None) -> tuple[int, bool]:
@@ -346,7 +340,7 @@ def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> di
     for part in text.split(","):
         name, equals, height = part.partition("=")
         try:
-            heights[name.strip()] = float(height)
+            heights[_name(name.strip(), "marker")] = float(height)
         except ValueError:
             equals = ""
         if not equals or not name.strip():

@@ -25,7 +25,6 @@ def robots(name: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help=RO
 
 def mechanisms(
     name: Annotated[str | None, typer.Argument(metavar="[MECHANISM]", help="describe this mechanism")] = None,
-    robot: Annotated[str, typer.Option(help="robot whose cables are listed with their parameters")] = "smooth_arm",
 ) -> None:
     """List the mechanisms, or describe a mechanism. Its cause, remedy, parameters and priors."""
     from rfdropo_bayes.model.mechanism_listings import mechanism_facts, mechanism_rows
@@ -34,7 +33,7 @@ def mechanisms(
         _show(mechanism_rows())
         typer.echo("\nrfdropo mechanisms NAME describes a mechanism: parameters, default priors, remedy.")
     else:
-        facts, parameters = mechanism_facts(name, robot)
+        facts, parameters = mechanism_facts(name)
         _say(facts)
         typer.echo()
         _show(parameters)

@@ -21,7 +21,6 @@ from rfdropo_bayes.cli import (
     result_commands,
 )
 from rfdropo_bayes.cli.options import (
-    AsJson,
     ExperimentFile,
     OutFolder,
     Overrides,
@@ -68,7 +67,6 @@ def calibrate(
     out: OutFolder = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    as_json: AsJson = False,
     fit: Annotated[
         Path | None,
         typer.Option("--from", help="folder of an earlier calibration of this robot, at which optimisations start"),
@@ -83,15 +81,11 @@ def calibrate(
 
     model = Model.read(experiment, overrides)
     result = run_fit(model, out=folder, fit=fit, resume=resume, overwrite=overwrite)
-    show_calibration(result, experiment, as_json=as_json)
+    show_calibration(result, experiment)
 
 
 def simulate(
-    experiment: ExperimentFile,
-    out: OutFolder = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    overrides: Overrides = None,
+    experiment: ExperimentFile, out: OutFolder = None, overwrite: Overwrite = False, overrides: Overrides = None
 ) -> None:
     """Simulate the commands of an experiment. Writes NetCDF and CSV, prints the error against the recordings."""
     folder = folder_for("simulate", experiment, out, overrides, overwrite=overwrite)
@@ -99,9 +93,9 @@ def simulate(
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.simulate import simulate_all
 
-    say_step(f"simulating the recordings of {experiment}", show=False if as_json else None)
+    say_step(f"simulating the recordings of {experiment}")
     content = simulate_all(Model.read(experiment, overrides), folder, overwrite=overwrite)
-    show_simulation(content, as_json=as_json)
+    show_simulation(content)
 
 
 # In the order in which they are used, which --help shows.

@@ -29,7 +29,6 @@ def deploy(
     deployment: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="the deployment file")],
     mode: Annotated[str, typer.Option(help="check, home, dry-run, shadow, run or replay")] = "dry-run",
     out: Annotated[Path | None, typer.Option("--out", help="folder of the session; by default runs/NAME-TIME")] = None,
-    simulated: Annotated[bool, typer.Option("--simulated", help="use simulated drives, whatever the mode")] = False,
     recording: Annotated[Path | None, typer.Option(help="session folder or trajectory to replay")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="print no live view")] = False,
     overrides: Annotated[
@@ -51,9 +50,9 @@ def deploy(
     folder = out or Path("runs") / f"{deployment.stem}-{time.strftime('%Y%m%d-%H%M%S')}"
     show = not quiet and sys.stdout.isatty() and mode != "check"
     settings = load_deployment(deployment, overrides or [])
-    if not quiet and (simulated or mode == Mode.DRY_RUN):
+    if not quiet and mode == Mode.DRY_RUN:
         typer.echo("starting the simulated drives; the first start of a trunk compiles, for minutes", err=True)
-    outcome = run_session(settings, mode, folder, simulated=simulated, commands=recording, show=show, keyboard=True)
+    outcome = run_session(settings, mode, folder, commands=recording, show=show, keyboard=True)
     for channel, identity in outcome.drives.items() if mode == "check" else ():
         typer.echo(f"{channel}: " + ", ".join(f"{name} {value:#x}" for name, value in identity.items()))
     for channel, lacking in outcome.without.items() if mode == "check" else ():
@@ -101,7 +100,6 @@ def doctor(
     deployment: Annotated[
         Path | None, typer.Argument(metavar="[DEPLOYMENT.toml]", help="deployment file that names the bus")
     ] = None,
-    seconds: Annotated[float, typer.Option(help="length of each of five idle runs, in seconds")] = 2.0,
 ) -> None:
     """Test this machine, its clock and its bus. Prints JSON; the exit status is 1 if something is wrong."""
     from rfdropo_bayes.deployment.doctor import examine
@@ -109,7 +107,7 @@ def doctor(
 
     settings = None if deployment is None else load_deployment(deployment)
     rate = 100.0 if settings is None else settings.rate_hz
-    report = examine(None if settings is None else settings.bus, rate, seconds)
+    report = examine(None if settings is None else settings.bus, rate)
     typer.echo(json.dumps(report, indent=2))
     if report["problems"]:
         raise typer.Exit(FAILED)

@@ -34,7 +34,6 @@ Overrides = Annotated[
 Resume = Annotated[bool, typer.Option("--resume", help="go on from the checkpoint of an interrupted run")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="start anew, whatever the folder holds")]
 WRITTEN = ("experiment", "config", "extended")  # names of the experiment files that init, runs and audits write
-AsJson = Annotated[bool, typer.Option("--json", help="print the result as JSON, and nothing else")]
 
 
 def folder_for(

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from rfdropo_bayes.cli.options import (
-    AsJson,
     ExperimentFile,
     OutFolder,
     Overrides,
@@ -18,7 +17,6 @@ from rfdropo_bayes.cli.options import (
     folder_for,
     see_calibration,
 )
-from rfdropo_bayes.cli.terminal_summary import say
 from rfdropo_bayes.errors import InputError
 
 
@@ -37,7 +35,6 @@ def train(
     out: OutFolder = None,
     resume: Resume = False,
     overwrite: Overwrite = False,
-    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Train a policy and play it. Writes report.html, policy.onnx, its card and its learning curve."""
@@ -62,8 +59,7 @@ def train(
     summary = learn(model, folder, fit=fit, resume=resume, overwrite=overwrite)
     done = f"after {summary['steps']} steps in {summary['seconds']:.0f} s: {training_sentence(summary)}"
     ahead = shlex.join(["rfdropo", "evaluate", str(folder / "config.toml"), "--policy", str(folder)])
-    lines = (done, f"policy: {folder / POLICY}", f"page: {folder / PAGE}", f"next: {ahead}")
-    say(summary, *lines, as_json=as_json)
+    typer.echo(f"{done}\npolicy: {folder / POLICY}\npage: {folder / PAGE}\nnext: {ahead}")
 
 
 def _task_and_goal(task: str | None, goal: str | None) -> list[str]:
@@ -93,9 +89,7 @@ def evaluate(
     ],
     out: OutFolder = None,
     episodes: Annotated[int, typer.Option(help="number of episodes of each policy, the same for all")] = 200,
-    seed: Annotated[int, typer.Option(help="seed of the parameters and goals of the episodes")] = 0,
     overwrite: Overwrite = False,
-    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Play policies on the same episodes. Writes success with intervals, every episode, a figure and animations."""
@@ -105,8 +99,8 @@ def evaluate(
     from rfdropo_bayes.verbs.evaluate import evaluate as play
 
     model = Model.read(experiment, overrides)
-    evaluation = play(model, policy, folder, episodes=episodes, seed=seed, overwrite=overwrite)
-    say(evaluation, evaluation_table(evaluation), f"table: {folder / TABLE}", as_json=as_json)
+    evaluation = play(model, policy, folder, episodes=episodes, overwrite=overwrite)
+    typer.echo(f"{evaluation_table(evaluation)}\ntable: {folder / TABLE}")
 
 
 TASKS = {"reach": "TrunkReach-v0", "push": "TrunkPush-v0"}

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from rfdropo_bayes.cli.options import AsJson, Overrides, Overwrite, see_calibration
+from rfdropo_bayes.cli.options import Overrides, Overwrite, see_calibration
 from rfdropo_bayes.cli.terminal_summary import show_calibration, show_prediction
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.experiment_file import look_through
@@ -38,7 +38,6 @@ def predict(
     episode: Episode = None,
     group: PredictedGroup = None,
     overwrite: Overwrite = False,
-    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Predict the motion under new commands. Writes mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
@@ -54,7 +53,7 @@ def predict(
     from rfdropo_bayes.results.calibrated import Calibration
     from rfdropo_bayes.verbs.predict import predict as predict_motion
 
-    say_step(f"predicting {commands} with draws of {fit}", show=False if as_json else None)
+    say_step(f"predicting {commands} with draws of {fit}")
     prediction = predict_motion(
         Calibration.of_posterior(fit, Model.read(experiment, overrides)),
         _from_here(commands),
@@ -64,8 +63,7 @@ def predict(
         group=group,
         overwrite=overwrite,
     )
-    files = [str(out / f"prediction.{ending}") for ending in ("nc", "csv")]
-    show_prediction({**prediction.content, "files": files}, as_json=as_json)
+    show_prediction(prediction.content, [out / "prediction.nc", out / "prediction.csv"])
 
 
 def adapt(
@@ -80,7 +78,6 @@ def adapt(
     seconds: Annotated[float | None, typer.Option(help="seconds from the start that are used; all by default")] = None,
     group: Group = None,
     overwrite: Overwrite = False,
-    as_json: AsJson = False,
     overrides: Overrides = None,
 ) -> None:
     """Adapt a calibration to another session. One short recording updates the parameters that vary between sessions;
@@ -106,7 +103,7 @@ def adapt(
         group=group,
         overwrite=overwrite,
     )
-    show_calibration(result, as_json=as_json)
+    show_calibration(result)
 
 
 def _from_here(name: str) -> str:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,30 +27,15 @@ COLOURS = {
     "partly_explained": FAIR,
     "unexplained": BAD,
 }
-CALIBRATED = ("title", "status", "headline", "randomisation", "parameters", "rmse", "log_evidence", "cautions")
-AUDITED = ("verdict", "sentence", "findings", "gain", "next_experiment", "cautions")
 MOST_ROWS = 20
 
 
-def say(content: Mapping[str, Any], *lines: str, as_json: bool) -> None:
-    """Print a result as JSON, or lines of words about it."""
-    if as_json:
-        typer.echo(json.dumps(content, indent=2))
-    else:
-        for line in lines:
-            typer.echo(line)
-
-
-def show_calibration(calibration: Calibration, experiment: Path | None = None, *, as_json: bool) -> None:
+def show_calibration(calibration: Calibration, experiment: Path | None = None) -> None:
     """Print the result of a finished calibration: headline, table of parameters, cautions, next command, and path of
     the report. The next command is an audit of ``experiment`` if there are cautions.
     """
     summary, folder = calibration.content, calibration.folder or Path()
     report = folder / "report.html"
-    if as_json:
-        chosen = {key: summary[key] for key in CALIBRATED if key in summary}
-        say({**chosen, "folder": str(folder), "report": str(report)}, as_json=as_json)
-        return
     console = _console()
     for sentence in summary["headline"]:
         style = COLOURS[calibration.verdict] if sentence == calibration.sentence else ""
@@ -78,12 +62,8 @@ def show_calibration(calibration: Calibration, experiment: Path | None = None, *
     console.print(f"report: {report}", soft_wrap=True)
 
 
-def show_audit(content: Mapping[str, Any], folder: Path, *, as_json: bool) -> None:
+def show_audit(content: Mapping[str, Any], folder: Path) -> None:
     """Print the result of an audit; ``content`` is of audit.json."""
-    files = {"folder": str(folder), "report": str(folder / "report.html"), "extended": str(folder / "extended.toml")}
-    if as_json:
-        say({**{key: content[key] for key in AUDITED if key in content}, **files}, as_json=as_json)
-        return
     from rfdropo_bayes.report.sentences import sentences
 
     console = _console()
@@ -103,18 +83,18 @@ def show_audit(content: Mapping[str, Any], folder: Path, *, as_json: bool) -> No
         console.print(_parameters(rows[:MOST_ROWS]))
     console.print(f"next: {content['next_experiment']['sentence']}", soft_wrap=True)
     if content["adopted"]:
-        again = shlex.join(["rfdropo", "calibrate", files["extended"], "--out", "OUT"])
+        again = shlex.join(["rfdropo", "calibrate", str(folder / "extended.toml"), "--out", "OUT"])
         console.print(f"then: {again}", soft_wrap=True)
-    console.print(f"report: {files['report']}; extended model: {files['extended']}", soft_wrap=True)
+    console.print(f"report: {folder / 'report.html'}; extended model: {folder / 'extended.toml'}", soft_wrap=True)
 
 
-def show_simulation(content: Mapping[str, Any], *, as_json: bool) -> None:
+def show_simulation(content: Mapping[str, Any]) -> None:
     """Print the distance of a simulation from its recordings; ``content`` is of simulation.json."""
     runs = content["recordings"].items()
     lines = [f"{name}: {run['status']}{_off(run['error_mm'])}; {run['files'][0]}" for name, run in runs]
     if content["error_mm"] is not None and len(lines) > 1:
         lines.append(f"all of them{_off(content['error_mm'])}")
-    say(content, *lines, as_json=as_json)
+    typer.echo("\n".join(lines))
 
 
 def _off(error: Mapping[str, float] | None) -> str:
@@ -127,8 +107,8 @@ def _off(error: Mapping[str, float] | None) -> str:
     )
 
 
-def show_prediction(facts: Mapping[str, Any], *, as_json: bool) -> None:
-    """Print a description of a prediction; ``facts`` is the content of prediction.json."""
+def show_prediction(facts: Mapping[str, Any], files: Sequence[Path]) -> None:
+    """Print a description of a prediction and its files; ``facts`` is the content of prediction.json."""
     start = "from the measured first row" if facts["start_pose_known"] else "without a measured first row"
     lines = [f"{facts['rows']} rows {start}, under {facts['draws']} draws of {facts['posterior']}"]
     if facts["group_fitted"] is not None:
@@ -137,8 +117,8 @@ def show_prediction(facts: Mapping[str, Any], *, as_json: bool) -> None:
     if facts.get("unseen_session"):
         lines.append(facts["unseen_session"])
     lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
-    lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in facts["files"])]
-    say(facts, *lines, as_json=as_json)
+    lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in files)]
+    typer.echo("\n".join(lines))
 
 
 def _console() -> Console:

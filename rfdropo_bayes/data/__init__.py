@@ -7,7 +7,6 @@ from rfdropo_bayes.data.first_command import common_beginning
 from rfdropo_bayes.data.matching import check_channels, shared_markers
 from rfdropo_bayes.data.named_columns import CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
-from rfdropo_bayes.data.plain_csv import read_plain_csv
 from rfdropo_bayes.data.recorded import GOAL_AXES, Measured, Origin, SentCommands
 from rfdropo_bayes.data.repeats import command_openings, group_repeats, noise_floor, same_opening
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
@@ -15,35 +14,3 @@ from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, lo
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.data.unseen import first_row_only, load_unseen, one_at_a_time, start_is_known
 from rfdropo_bayes.files import DATA_VARIABLE
-
-__all__ = [
-    "DATA_VARIABLE",
-    "GOAL_AXES",
-    "CsvColumns",
-    "DataSpec",
-    "Faults",
-    "Measured",
-    "Origin",
-    "RecordingEntry",
-    "SentCommands",
-    "Trajectory",
-    "check_channels",
-    "command_openings",
-    "commands_alone",
-    "common_beginning",
-    "find_data_file",
-    "find_faults",
-    "first_row_only",
-    "group_repeats",
-    "load_recordings",
-    "load_unseen",
-    "noise_floor",
-    "one_at_a_time",
-    "read_asl_csv",
-    "read_optitrack_csv",
-    "read_plain_csv",
-    "read_sofa_csv",
-    "same_opening",
-    "shared_markers",
-    "start_is_known",
-]

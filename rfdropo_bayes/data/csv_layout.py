@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -14,6 +15,8 @@ SEPARATORS = (",", ";", "\t", "|", " ")
 """In the order in which they are preferred; a space stands for any number of spaces and tabs."""
 SAMPLED = 40  # rows that are tried with each separator
 MOST_SHOWN = 120  # letters of a row that an error shows
+COMMENTS = ("#", "%", "//")  # how lines begin that are not part of a table
+_MARKED = re.compile(r"\s*#+\s*(?=[\w\"])")  # a comment sign in front of the names of columns, as NumPy writes it
 _NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)|na|null|none", re.IGNORECASE)
 _COMMA = re.compile(r"[+-]?\d*,\d+(e[+-]?\d+)?", re.IGNORECASE)
 _DATE = re.compile(r"\d{4}-\d\d-\d\d([T ].*)?|\d+:\d\d(:\d\d)?([.,]\d+)?")
@@ -52,6 +55,38 @@ def dialect_of(lines: Sequence[str]) -> Dialect:
         return Dialect(separator, ".")
     told = (cell for line in rows if "," in line for cell in cells_of(line, separator))
     return Dialect(separator, "," if any(_COMMA.fullmatch(cell.strip()) for cell in told) else ".")
+
+
+def table_lines(lines: Sequence[str]) -> list[str]:
+    """The lines of a table from its names on, or from its rows on if no line names them.
+
+    Programs write other lines above a table: comments, and lines of other widths. They are left out if no row of
+    values is among them. A comment sign in front of the names is removed.
+    """
+    separator = dialect_of(["", *lines[-SAMPLED:]]).separator
+    widths = Counter(len(cells_of(line, separator)) for line in lines[-SAMPLED:])
+    width = widths.most_common(1)[0][0]
+    bare = (_MARKED.sub("", line, count=1) for line in lines)
+    start = next(row for row, line in enumerate(bare) if len(cells_of(line, separator)) == width)
+    while lines[start].lstrip().startswith(COMMENTS) and _is_header(lines[start + 1 : start + 2], separator, width):
+        start += 1
+    above = [line for line in lines[:start] if not line.lstrip().startswith(COMMENTS)]
+    first = _MARKED.sub("", lines[start], count=1)
+    if any(_holds_values(line, separator) for line in above) or (above and not _is_header([first], separator, width)):
+        return list(lines)
+    return [first, *lines[start + 1 :]]
+
+
+def _is_header(line: Sequence[str], separator: str, width: int) -> bool:
+    """Whether a line, if there is one, has a cell for each column and no values."""
+    cells = [cell.strip() for cell in cells_of(line[0], separator)] if line else []
+    return len(cells) == width > 1 and not any(is_value(cell) and cell for cell in cells)
+
+
+def _holds_values(line: str, separator: str) -> bool:
+    """Whether a line has several cells, and more values than words."""
+    cells = [cell for cell in cells_of(line, separator) if cell.strip()]
+    return len(cells) > 1 and 2 * sum(is_value(cell) for cell in cells) > len(cells)
 
 
 def _fit(lines: Sequence[str], separator: str) -> tuple[bool, float, int, int]:

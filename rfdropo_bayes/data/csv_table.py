@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.data.csv_layout import SAMPLED, cells_of, dialect_of, header_of, is_value, units_above, without_names
+from rfdropo_bayes.data.csv_layout import cells_of, dialect_of, header_of, table_lines, units_above, without_names
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
@@ -76,9 +76,12 @@ def unnamed_rows(path: Path) -> list[list[str]] | None:
     Raises:
         InputError: see `read_text`.
     """
-    lines = read_text(path)[:HEAD].splitlines()[: SAMPLED + 1]
-    separator = dialect_of(lines).separator if lines else ","
-    if len(lines) < 2 or not without_names(lines, separator):
+    lines = read_text(path)[:HEAD].splitlines()
+    if len(lines) < 2:
+        return None
+    lines = table_lines(lines[:-1])  # the last line of the head may be cut
+    separator = dialect_of(lines).separator
+    if not without_names(lines, separator):
         return None
     return [[cell.strip() for cell in cells_of(line, separator)] for line in lines[:3]]
 
@@ -87,6 +90,7 @@ class CsvTable:
     """A rectangular table of numbers with named columns.
 
     Values may be separated by commas, semicolons, tabs, bars or spaces, and decimals may follow a comma (`dialect_of`).
+    Lines that a program wrote above the names are left out (`table_lines`).
     A second line of units is no row: ``units`` maps the names of columns to their units.
 
     Args:
@@ -136,12 +140,9 @@ class CsvTable:
             raise InputError("the file is empty", where=str(self.path), remedy="give a CSV with a header and rows")
         if len(lines) == 1:
             raise InputError("has a header but no rows", where=str(self.path), remedy="record or export it again")
-        bare = [lines[0].removeprefix("#"), *lines[1:]]
-        if dialect_of(bare).separator == " ":  # NumPy marks the names this way if it separates by spaces
-            lines = bare
+        lines = table_lines(lines)
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
-        _check_first_line(self.path, lines, dialect.separator)
         header = header_of(self.path, lines, dialect.separator, names)
         rows = lines if without_names(lines, dialect.separator) else lines[1:]
         units = units_above(rows, dialect.separator) or []
@@ -158,7 +159,7 @@ class CsvTable:
             low_memory=False,
             index_col=False,
         )
-        self.frame.columns = _numbered_names(header)
+        self.frame.columns = [name or f"Unnamed: {column}" for column, name in enumerate(header)]
 
     @classmethod
     def of_lines(cls, path: Path, lines: list[str]) -> CsvTable:
@@ -288,11 +289,6 @@ def _check_names(path: Path, names: Sequence[str]) -> None:
         raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
 
 
-def _numbered_names(header: Sequence[str]) -> list[str]:
-    """Names of columns, with a number for each empty name."""
-    return [name or f"Unnamed: {column}" for column, name in enumerate(header)]
-
-
 def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: int) -> None:
     for row, line in enumerate(rows):
         if separator != " " and '"' not in line and line.count(separator) == fields - 1:
@@ -307,24 +303,3 @@ def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: 
                 if count == 2 * fields
                 else ("fetch the file again or drop the row" if last else "repair the row"),
             )
-
-
-def _check_first_line(path: Path, lines: Sequence[str], separator: str) -> None:
-    """Raise an InputError if the table begins further down, below a program's preamble."""
-    width = len(cells_of(lines[-1], separator))
-    first = next(row for row, line in enumerate(lines) if len(cells_of(line, separator)) == width)
-    cells = cells_of(lines[first], separator)
-    if first == 0 or len(lines) - first < 2:
-        return
-    if not any(is_value(cell) and cell.strip() for cell in cells):
-        raise InputError(
-            f"the names of its {width} columns stand in line {first + 1}, below other lines",
-            where=str(path),
-            remedy="leave out the lines above them",
-        )
-    if lines[0].lstrip().startswith(("#", "%", "//")) and all(map(is_value, cells)):
-        raise InputError(
-            f"the rows of its {width} columns begin in line {first + 1}, and no line names them",
-            where=str(path),
-            remedy="write one line of names in the place of the lines above them",
-        )

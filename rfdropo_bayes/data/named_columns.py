@@ -25,11 +25,11 @@ from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.recorded import Measured, Origin, Recorded, SentCommands
-from rfdropo_bayes.data.sample_times import TimeUnit, rounded_notes
+from rfdropo_bayes.data.sample_times import TimeUnit, repeated_rows, rounded_notes, spread_repeats
 from rfdropo_bayes.errors import InputError
 
 FORMAT = "csv"
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 PASCALS = {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "mbar": 1e2, "bar": 1e5, "psi": 6894.757293168}
 COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
     "rad": ("rad", 1.0),
@@ -41,7 +41,25 @@ COMMAND_UNITS = {name: ("m", factor) for name, factor in METRES.items()} | {
 }
 COUNTS = "counts"  # encoder counts, or steps of a drive: angles, once `CsvColumns.counts_per_turn` is known
 CommandUnit = Literal[
-    "m", "cm", "mm", "rad", "deg", "counts", "N", "N m", "Pa", "kPa", "MPa", "mbar", "bar", "psi", "V", "A", "%", "-"
+    "m",
+    "cm",
+    "mm",
+    "in",
+    "rad",
+    "deg",
+    "counts",
+    "N",
+    "N m",
+    "Pa",
+    "kPa",
+    "MPa",
+    "mbar",
+    "bar",
+    "psi",
+    "V",
+    "A",
+    "%",
+    "-",
 ]
 
 
@@ -134,7 +152,7 @@ class CsvColumns(BaseModel):
     positions: list[tuple[str, str, str]] = Field(
         min_length=1, description="columns of x, y and z of each marker, base to tip"
     )
-    position_unit: Literal["m", "cm", "mm"] = Field(
+    position_unit: Literal["m", "cm", "mm", "in"] = Field(
         description='unit of the positions; the header of a "motive-csv" file overrides it'
     )
     axes: Annotated[tuple[str, str, str], AfterValidator(_each_once)] = Field(
@@ -395,7 +413,7 @@ def in_base(place: Float[np.ndarray, "*rows marker 3"], columns: CsvColumns) -> 
 def _times(table: CsvTable, columns: CsvColumns) -> Float[np.ndarray, " rows"]:
     if columns.time is None or untimed(columns):
         return float(columns.sample_time or ROW_SECONDS) * np.arange(len(table))
-    return _from_first(table, columns.time, columns.time_unit)
+    return spread_repeats(_from_first(table, columns.time, columns.time_unit))
 
 
 def untimed(columns: CsvColumns) -> bool:
@@ -407,7 +425,16 @@ def _timing_notes(table: CsvTable, columns: CsvColumns, time: Float[np.ndarray, 
     """Notes on doubtful times."""
     if untimed(columns):
         return [UNTIMED]
-    return [] if columns.time is None else rounded_notes(table.stamps(columns.time, columns.time_unit), time)
+    if columns.time is None:
+        return []
+    repeated = repeated_rows(_from_first(table, columns.time, columns.time_unit))
+    words = (
+        f"{len(repeated)} of {len(table)} rows, first row {repeated[0]}, have the stamp of the row before: they are "
+        "taken to lie evenly between their neighbours; leave them out if they are copies"
+        if len(repeated)
+        else ""
+    )
+    return [words] * bool(words) + rounded_notes(table.stamps(columns.time, columns.time_unit), time)
 
 
 def _from_first(table: CsvTable, clock: str, unit: TimeUnit) -> Float[np.ndarray, " rows"]:

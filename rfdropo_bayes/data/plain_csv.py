@@ -17,29 +17,9 @@ from rfdropo_bayes.data.named_columns import (
     origin_of,
     points,
     read_commands,
-    read_tables,
 )
 from rfdropo_bayes.data.sample_times import PER_SECOND
 from rfdropo_bayes.data.trajectory import Trajectory
-
-
-def read_plain_csv(
-    path: Path, columns: CsvColumns, commands: Path | None = None, *, mask_missing: bool = False
-) -> Trajectory:
-    """One recording.
-
-    Args:
-        path: file with the observations, and the commands unless they have their own file.
-        columns: mapping of the columns.
-        commands: file of the commands, if separate.
-        mask_missing: mask lost marker positions instead of rejecting the file.
-
-    Raises:
-        InputError: on a damaged file (see ``CsvTable``), a column that is not there, or files that do not fit together.
-    """
-    table = csv_table(path, columns)
-    source = command_table(commands, columns) or table
-    return Trajectory.build(*read_tables(table, source, columns, mask_missing=mask_missing))
 
 
 def csv_table(path: Path, columns: CsvColumns) -> CsvTable:

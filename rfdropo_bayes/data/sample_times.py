@@ -166,6 +166,24 @@ def check_times(time: Float[np.ndarray, " rows"], where: str, key: str = "time")
     )
 
 
+def repeated_rows(time: Float[np.ndarray, " rows"]) -> np.ndarray:
+    """Rows with the stamp of the row before, if they are few and the clock never goes back."""
+    gaps = np.diff(time)
+    repeated = np.flatnonzero(gaps == 0.0) + 1
+    few = np.all(gaps >= 0.0) and len(repeated) <= COARSE * len(gaps)
+    return repeated if few else repeated[:0]
+
+
+def spread_repeats(time: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+    """Times with `repeated_rows` evenly between the rows around them."""
+    repeated = repeated_rows(time)
+    if not len(repeated):
+        return time
+    own = np.setdiff1d(np.arange(len(time)), repeated)
+    behind = float(np.median(np.diff(time[own]))) * (len(time) - own[-1])  # for a stamp that the last rows repeat
+    return np.interp(np.arange(len(time)), np.append(own, len(time)), np.append(time[own], time[-1] + behind))
+
+
 def _of_groups(time: np.ndarray, gaps: np.ndarray) -> float:
     """Time from row to row [s] of rows that share stamps, from the first rows of the first and last group."""
     starts = np.flatnonzero(gaps > 0.0) + 1

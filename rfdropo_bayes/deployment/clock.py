@@ -121,12 +121,12 @@ class Jitter(NamedTuple):
     missed: int  # skipped cycles
 
 
-def measure_jitter(period: float, seconds: float, fifo: bool = True) -> Jitter:
+def measure_jitter(period: float, seconds: float) -> Jitter:
     """Run an idle loop, in its own thread so that the calling thread keeps its priority."""
     jitters: list[Jitter] = []
 
     def loop() -> None:
-        with real_time() if fifo else contextlib.nullcontext(False) as granted:
+        with real_time() as granted:
             clock = CycleClock(period)
             ticks = [clock.wait() for _ in range(max(2, round(seconds / period)))]
         jitters.append(Jitter(granted, np.array([tick.lateness for tick in ticks]), sum(tick.missed for tick in ticks)))

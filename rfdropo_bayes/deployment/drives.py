@@ -558,7 +558,7 @@ class Drives:
             self._next_heartbeat = now + 0.25 * self.guards.master_timeout_s - 1e-3
             self.network.send_message(objects.HEARTBEAT + self.guards.master_node, bytes([NmtState.OPERATIONAL]))
 
-    def quick_stop(self, patience: float = 0.02) -> list[str]:
+    def quick_stop(self) -> list[str]:
         """Stop every drive at once, from any thread, whatever the control loop does; it stays stopped.
 
         The controlword goes out in its own PDO that needs no SYNC. If a frame cannot be sent, the others still
@@ -569,7 +569,7 @@ class Drives:
         """
         self._stopped.set()
         # Behind a cycle that is being sent: its set-points still say "enable", and would undo the stop.
-        locked = self._sending.acquire(timeout=patience)
+        locked = self._sending.acquire(timeout=0.02)
         failures = []
         try:
             for drive in self.all:

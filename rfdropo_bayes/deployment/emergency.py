@@ -28,15 +28,15 @@ STOP_KEYS = b" \x1bqQ\n\r"
 Hook = Callable[[], bool | str]  # returns True, or a word for the log, while a button is pressed
 
 
-def file_hook(path: Path, pressed: str) -> Hook:
-    """A hook that reads a file, as the kernel shows a GPIO pin (/sys/class/gpio/gpio17/value).
+def file_hook(path: Path) -> Hook:
+    """A hook that reads a file, as the kernel shows a GPIO pin (/sys/class/gpio/gpio17/value); 0 is pressed.
 
     A file that cannot be read counts as pressed: a wire that came off must stop the robot.
     """
 
     def look() -> bool:
         try:
-            return path.read_text().strip() == pressed
+            return path.read_text().strip() == "0"
         except OSError:
             return True
 

@@ -20,6 +20,7 @@ from rfdropo_bayes.tables import parse_table
 
 _SLACK = 0.7  # of the homing tension: a cable is let out to here before it is pulled, so that all approach from below
 _MEDIAN = 5  # cycles: a torque is noisy, and one reading must not decide
+VALID_H = 24.0  # age above which a result is refused
 TORQUE_FACTOR = 2.0  # the torque limit as a multiple of the homing tension
 
 
@@ -63,7 +64,7 @@ class HomingResult(BaseModel):
             raise InputError(f"cannot be written ({error})", where=str(path), remedy="correct [homing] file") from None
 
 
-def load_homing(path: Path, robot: Robot, valid_h: float) -> HomingResult:
+def load_homing(path: Path, robot: Robot) -> HomingResult:
     """Read the result of a homing.
 
     Raises:
@@ -78,9 +79,9 @@ def load_homing(path: Path, robot: Robot, valid_h: float) -> HomingResult:
     if result.robot != robot.name or tuple(home.channel for home in result.homes) != robot.channel_names:
         raise InputError(f"belongs to robot {result.robot!r}, whose name or channels differ", where=where, remedy=again)
     age = datetime.datetime.now(datetime.UTC) - result.date
-    if age > datetime.timedelta(hours=valid_h):
+    if age > datetime.timedelta(hours=VALID_H):
         raise InputError(
-            f"is {age.total_seconds() / 3600:.1f} h old; the limit is {valid_h:g} h", where=where, remedy=again
+            f"is {age.total_seconds() / 3600:.1f} h old; the limit is {VALID_H:g} h", where=where, remedy=again
         )
     return result
 
@@ -124,7 +125,8 @@ class Homing:
     def _search(self, loop: ControlLoop, index: int, tension: float, below: bool) -> Home:
         """Let a cable out until it is below a tension, or pull it until it is above."""
         motor, drive, name = loop.motors[index], loop.drives.all[index], loop.drives.all[index].name
-        end = time.monotonic() + self._table.time_s
+        longest = 2.0 * self._table.travel_m / self._table.rate_m_s
+        end = time.monotonic() + longest
         recent: list[float] = []
         step = self._table.rate_m_s * loop.period * (-1.0 if below else 1.0)
         goal = loop.set_points.length.copy()
@@ -136,7 +138,7 @@ class Homing:
             if below and goal[index] <= motor.length_limit_m[0] + 1e-9:
                 break  # slack enough: it may hang loose further than the cap lets it out
             if time.monotonic() > end:
-                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {self._table.time_s:g} s")
+                raise Stop(Cause.HOMING_FAILED, f"{name} carries {carried:.2f} N after {longest:g} s")
             goal[index] += step
             if goal[index] > motor.length_limit_m[1]:
                 way = 1e3 * self._table.travel_m

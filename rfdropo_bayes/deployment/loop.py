@@ -29,6 +29,8 @@ from rfdropo_bayes.robots import Robot
 
 _AWAY = 1e-4  # [m]: a braked drive farther than this from its command holds another command
 _ANSWER = 0.6  # of a period: how long a cycle waits for the drives; the rest is for policy, log and sleep
+SLOW = 0.2  # share of each motor's own limit: the rate of the ramp to the start pose
+HOLD_S = 0.3  # for which the drives are watched after a stop
 ENABLE_S = 2.0  # within this time the drives must be enabled
 
 
@@ -231,8 +233,7 @@ class ControlLoop:
 
     def go_to(self, length: Float[np.ndarray, " channel"], phase: Phase, settle: float) -> None:
         """Move slowly to these lengths [m], and rest there."""
-        slow = self.safety.start_rate_m_s
-        limit = np.array([motor.rate_limit_m_s for motor in self.motors]) / 5.0 if slow is None else slow
+        limit = SLOW * np.array([motor.rate_limit_m_s for motor in self.motors])
         goal = self.set_points.clamp(length)
         self.command = goal.copy()
         acted = True
@@ -323,7 +324,7 @@ class ControlLoop:
                     self.cycle(Phase.STOPPING, acted)
                     acted = False
                 self.stop_time = time.monotonic() - began
-                for _ in range(round(self.safety.hold_s / self.period)):
+                for _ in range(round(HOLD_S / self.period)):
                     self.cycle(Phase.HOLDING)
                 if stop.cause is Cause.FINISHED and self.safety.after == "release":
                     self._release()
@@ -353,7 +354,7 @@ class ControlLoop:
         after = AfterStop(self.drives)
         for failure in self.drives.quick_stop():
             self._say(f"quick stop not sent: {failure}")
-        end = time.monotonic() + self.safety.hold_s
+        end = time.monotonic() + HOLD_S
         failed = False
         while time.monotonic() < end:
             try:

@@ -166,7 +166,7 @@ class _Session:
         table = self.settings.homing
         if table.file is None or self.simulated or self.mode in (Mode.HOME, Mode.CHECK):
             return [float(motor.offset_counts) for motor in self.robot.motors]
-        result = load_homing(Path(table.file), self.robot, table.valid_h)
+        result = load_homing(Path(table.file), self.robot)
         self._facts["homed"] = result.date.isoformat()
         return [float(home.offset_counts) for home in result.homes]
 
@@ -263,7 +263,7 @@ class _Session:
             self.robot, self.drives, markers, self.log, safety, self.period, lambda text: self.log.event("stop", text)
         )
         if safety.button_file is not None:
-            hooks = (*hooks, file_hook(Path(safety.button_file), safety.button_pressed))
+            hooks = (*hooks, file_hook(Path(safety.button_file)))
 
         def press(what: str, silence: bool) -> None:
             loop.demanded = Stop(Cause.DEADLINES if silence else Cause.EMERGENCY_STOP, what)

@@ -100,12 +100,10 @@ class SafetyTable(_Table):
         heartbeat_s: drives stop without the master's heartbeat for this time, and the master without a drive's.
         following_error_m, following_time_s: length and time of a lag behind set-points at which a drive reports a
         fault.
-        start_rate_m_s: rate of the ramp to the start pose; a fifth of each motor's own limit by default.
         settle_s: rest in the start pose before the policy begins.
-        hold_s: time for which the drives are watched after a stop.
         after: "hold" leaves the drives braked and holding; "release" switches them off, which slackens the cables, if
             the session ended as planned.
-        button_file, button_pressed: a file that shows a button, and its content while it is pressed.
+        button_file: a file that shows a button; it contains 0 while the button is pressed.
     """
 
     misses: int = Field(default=3, ge=1)
@@ -113,12 +111,9 @@ class SafetyTable(_Table):
     heartbeat_s: float = Field(default=0.06, ge=0.02)
     following_error_m: float = Field(default=0.005, gt=0.0)
     following_time_s: float = Field(default=0.05, gt=0.0)
-    start_rate_m_s: float | None = Field(default=None, gt=0.0)
     settle_s: float = Field(default=1.0, ge=0.0)
-    hold_s: float = Field(default=0.3, ge=0.1)
     after: Literal["hold", "release"] = "hold"
     button_file: str | None = None
-    button_pressed: str = "0"
 
     def guards(self, nodes: Collection[int]) -> Guards:
         """For the drives of these ``nodes``: the master takes the highest free number."""
@@ -138,21 +133,17 @@ class HomingTable(_Table):
         file: file of the result; none if the robot file has the motors' offsets.
         rate_m_s: cable speed of the search.
         travel_m: longest travel of each cable.
-        time_s: longest search for each cable.
         rounds: number of passes over all cables: pulling a cable changes the others.
-        valid_h: age above which a result is refused.
     """
 
     file: str | None = None
     rate_m_s: float = Field(default=0.002, gt=0.0)
     travel_m: float = Field(default=0.03, gt=0.0)
-    time_s: float = Field(default=30.0, gt=0.0)
     rounds: int = Field(default=2, ge=1)
-    valid_h: float = Field(default=24.0, gt=0.0)
 
 
 class SimulationSettings(_Table):
-    """Simulation that replaces the hardware with `--mode dry-run` and `--simulated`.
+    """Simulation that replaces the hardware with `--mode dry-run`.
 
     Attributes:
         plant: "springs", or MODULE:CALLABLE.

@@ -15,7 +15,7 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
 from rfdropo_bayes.discrepancy.fit import Fit
 from rfdropo_bayes.discrepancy.gain import LEVELS, noise_distance
-from rfdropo_bayes.discrepancy.law_words import unknown_record
+from rfdropo_bayes.discrepancy.law_words import law_record, ports_record
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.prequential import in_words, prequential, span_in_words
 from rfdropo_bayes.discrepancy.score import likeness
@@ -39,14 +39,18 @@ def record(
 
     ``doubts`` are cautions on its recordings.
     """
-    findings = [_finding(answer, step, stage) for step, stage in zip(answer.causes.steps, _shares(answer), strict=True)]
+    first = answer.test_series[0]
+    refits = answer.steps[0].refits if answer.steps else answer.refits
+    findings = [_finding(answer, step, stage) for step, stage in zip(answer.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
-    base_rms = _rms(answer, answer.base.residual)
+    measured = answer.target.measurements
+    base_rms = float(np.sqrt(np.mean(measured.series(answer.base.residual)[measured.valid] ** 2)))
+    coordinates, base_x = answer.problem.coordinates, answer.base.x
     return {
         "verdict": answer.verdict,
         "sentence": sentence(answer, findings),
         "findings": findings,
-        "candidates": _candidates(answer),
+        "candidates": [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows],
         "between": _between(answer, findings),
         "base_fit_converged": answer.base.converged,
         "out_of_time": bool(answer.cost.stopped),
@@ -54,9 +58,18 @@ def record(
         "not_done": list(answer.cost.unfinished),
         "left_out": dict(answer.problem.left_out),
         "adopted": [step.name for step in answer.adopted],
-        "unsupported": list(answer.causes.unsupported),
+        "unsupported": list(answer.unsupported),
         "bootstraps": answer.problem.rules.bootstraps,
-        "omnibus": [{"after": n, **_omnibus(tests)} for n, tests in enumerate(answer.causes.test_series)],
+        "omnibus": [
+            {
+                "after": n,
+                "p": tests.omnibus.p,
+                "finer_mesh": tests.refined,
+                "tests": tests.omnibus.single,
+                "blocks": [None if np.isnan(block) else block for block in tests.omnibus.blocks.tolist()],
+            }
+            for n, tests in enumerate(answer.test_series)
+        ],
         "gain": None
         if gain is None
         else {
@@ -73,15 +86,22 @@ def record(
         },
         "coverage": {} if gain is None else {f"{level:g}": gain.coverage[level] for level in LEVELS},
         "noise_floor_mm": MILLIMETRES * noise_distance(noise) if noise.source == REPEATS else None,
-        "numerical_error_mm": None if answer.doubts.numerical is None else MILLIMETRES * answer.doubts.numerical,
+        "numerical_error_mm": None if answer.numerical is None else MILLIMETRES * answer.numerical,
         "noise": _noise(answer),
         "channels": list(answer.target.measurements.names_of_channels),
         "residual_in_noise_deviations": base_rms,
-        "remainder": _remainder(answer),
+        "remainder": {
+            "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
+            "length_scale_s": answer.remainder.memory,
+            "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
+        },
         "where": _where(answer),
-        "cautions": [caution.as_dict() for caution in (*doubts, *answer.doubts.priors)],
-        "base_parameters": _parameters(answer, answer.base.free, answer.base.x),
-        **unknown_record(answer),
+        "cautions": [caution.as_dict() for caution in (*doubts, *answer.priors)],
+        "base_parameters": {
+            coordinates.names[i]: coordinates.named(base_x)[coordinates.names[i]] for i in answer.base.free
+        },
+        "ports": ports_record(answer),
+        "law": law_record(answer),
         "next_experiment": next_experiment,
         "rollouts": answer.cost.rollouts,
         "seconds": round(answer.cost.seconds, 2),
@@ -95,23 +115,20 @@ def record(
     }
 
 
-def _remainder(answer: Answer) -> dict[str, Any]:
-    return {
-        "amplitude_mm": MILLIMETRES * answer.remainder.amplitude,
-        "length_scale_s": answer.remainder.memory,
-        "log_likelihood_ratio": answer.remainder.log_likelihood_ratio,
-    }
-
-
 def _noise(answer: Answer) -> dict[str, Any]:
-    noise, shift, suspected = answer.target.noise.first, answer.doubts.shift, answer.doubts.suspected
+    """Noise of the markers in mm, and of other channels in their own units; of tensions as a share of the reading."""
+    noise, shift, suspected = answer.target.noise.first, answer.shift, answer.suspected
+    parts = zip(answer.target.measurements.channels[1:], answer.target.noise.parts[1:], strict=True)
     return {
         "source": noise.source,
         "order": noise.order,
         "autocorrelation": noise.autocorrelation.tolist(),
         "standard_deviation_mm": (MILLIMETRES * noise.scale).tolist(),
         "correlation_between_channels": None if noise.correlation is None else np.round(noise.correlation, 3).tolist(),
-        "other_channels": _other_noise(answer),
+        "other_channels": {
+            channel.name: {"standard_deviation": part.scale.tolist(), "autocorrelation": part.autocorrelation.tolist()}
+            for channel, part in parts
+        },
         "shift_between_repeats_mm": None if shift is None else MILLIMETRES * shift,
         "suspected_mm": None if suspected is None else (MILLIMETRES * suspected.first.scale).tolist(),
     }
@@ -119,7 +136,7 @@ def _noise(answer: Answer) -> dict[str, Any]:
 
 def next_experiment(answer: Answer) -> dict[str, Any]:
     """Next step at the robot, in a sentence, and the candidates that it distinguishes."""
-    apart = next((step for step in answer.causes.steps if len(step.members) > 1), None)
+    apart = next((step for step in answer.steps if len(step.members) > 1), None)
     if answer.verdict == NO_DISCREPANCY:
         words = "No change is needed for commands like these; record larger and faster commands, and audit them."
     elif answer.verdict == NEGLIGIBLE:
@@ -131,11 +148,11 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--from)."
     elif not answer.converged:
         words = "Run `rfdropo calibrate`, look at its fit, and start the audit from it with --from."
-    elif answer.doubts.suspected is not None:
+    elif answer.suspected is not None:
         words = "Repeat one command sequence three times: the repeats show whether the noise agrees with [noise]."
     elif answer.target.noise.doubtful:
         words = "Repeat one command sequence three times, or state the noise in [noise]: then a slow discrepancy shows."
-    elif answer.verdict == UNEXPLAINED and answer.causes.steps:
+    elif answer.verdict == UNEXPLAINED and answer.steps:
         words = f"No candidate explains it: {_watch(answer)}, for a cause to add as in docs/mechanisms.md."
     elif answer.verdict == NO_VERDICT:
         words = "Nothing yet: raise [audit] minutes, and go on with --resume."
@@ -144,8 +161,8 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         both = " from ".join(spoken(member) for member in apart.members[:2])
         words = f"To tell {both}: {checks}. Or let `rfdropo design` propose commands that differ."
         return {"sentence": words, "separates": list(apart.members)}
-    elif not answer.causes.steps:
-        leading = [row.name for row in answer.causes.test_series[0].rows[:2]]
+    elif not answer.steps:
+        leading = [row.name for row in answer.test_series[0].rows[:2]]
         asked = " and ".join(spoken(each) for each in leading) or "candidates of your own"
         words = (
             f"Send the commands that `rfdropo design` proposes to separate {asked}, each three times; {_watch(answer)}."
@@ -153,7 +170,7 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         return {"sentence": words, "separates": leading}
     else:
         name, share = _largest(answer)
-        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.causes.steps) > 1 else ""
+        most = f", {100 * share:.0f} % of what is wrong" if share and len(answer.steps) > 1 else ""
         where = "Refine the simulation" if name == DISCRETISATION else f"Check {spoken(name)} on the robot"
         words = f"{where}{most}: {_remedy(answer, name)}."
         if not answer.adopted:
@@ -172,7 +189,7 @@ def _doubt(answer: Answer) -> str:
 
 def _largest(answer: Answer) -> tuple[str, float | None]:
     """The step that explains most of the discrepancy, and the share; the first step if no share is known."""
-    shares = zip(answer.causes.steps, _shares(answer), strict=True)
+    shares = zip(answer.steps, _shares(answer), strict=True)
     step, share = max(shares, key=lambda entry: -np.inf if entry[1] is None else entry[1])
     return step.name, share
 
@@ -194,30 +211,15 @@ def _watch(answer: Answer) -> str:
     return f"watch {marker} while the commands {span_in_words(first, last, answer.problem.timed)} are sent again"
 
 
-def _other_noise(answer: Answer) -> dict[str, Any]:
-    """Noise of the channels beside the markers, in their own units; of tensions as a share of the reading."""
-    parts = zip(answer.target.measurements.channels, answer.target.noise.parts, strict=True)
-    return {
-        channel.name: {"standard_deviation": part.scale.tolist(), "autocorrelation": part.autocorrelation.tolist()}
-        for channel, part in parts
-        if channel is not answer.target.measurements.channels[0]
-    }
-
-
-def _rms(answer: Answer, white: np.ndarray) -> float:
-    measured = answer.target.measurements
-    return float(np.sqrt(np.mean(measured.series(white)[measured.valid] ** 2)))
-
-
 def _shares(answer: Answer) -> list[float | None]:
     """Explained fraction that each step brought."""
     if not answer.validation.stages:
-        return [None] * len(answer.causes.steps)
+        return [None] * len(answer.steps)
     return [float(v) for v in np.diff([0.0, *answer.validation.stages])]
 
 
 def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]:
-    gain = answer.validation.gain if len(answer.causes.steps) == 1 else None
+    gain = answer.validation.gain if len(answer.steps) == 1 else None
     row = step.before.row(step.name)
     candidate = answer.problem.candidate(step.name)
     mechanism = candidate.mechanism if candidate else None
@@ -248,7 +250,7 @@ def _between(answer: Answer, findings: Sequence[dict[str, Any]]) -> dict[str, An
     if groups is None:
         return None
     keys = ("mechanism", "group", "parameters", "relative", "log_bayes_factor")
-    alike = [list(step.members[1:]) for step in answer.causes.steps]
+    alike = [list(step.members[1:]) for step in answer.steps]
     rows = [
         {**{key: finding[key] for key in keys}, "not_told_from": others}
         for finding, others in zip(findings, alike, strict=True)
@@ -315,20 +317,6 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
     return sizes
 
 
-def _parameters(answer: Answer, free: np.ndarray, x: np.ndarray) -> dict[str, float]:
-    named = answer.problem.coordinates.named(x)
-    return {answer.problem.coordinates.names[i]: named[answer.problem.coordinates.names[i]] for i in free}
-
-
-def _omnibus(tests: ScoreTests) -> dict[str, Any]:
-    return {
-        "p": tests.omnibus.p,
-        "finer_mesh": tests.refined,
-        "tests": tests.omnibus.single,
-        "blocks": [None if np.isnan(block) else block for block in tests.omnibus.blocks.tolist()],
-    }
-
-
 def _where(answer: Answer) -> dict[str, Any]:
     """Time and place of the base model's misfit."""
     scores, problem = prequential(answer.target, answer.base), answer.problem
@@ -341,13 +329,6 @@ def _where(answer: Answer) -> dict[str, Any]:
         "block_p": scores.p.tolist(),
         "marker_misfit": dict(zip(markers, misfit.tolist(), strict=True)),
     }
-
-
-def _candidates(answer: Answer) -> list[dict[str, Any]]:
-    """Score tests of all candidates at the base model, the best first."""
-    first = answer.causes.test_series[0]
-    refits = answer.causes.steps[0].refits if answer.causes.steps else answer.causes.refits
-    return [_candidate(answer, row, first, refits.get(row.name)) for row in first.rows]
 
 
 def _candidate(answer: Answer, row: ScoreRow, tests: ScoreTests, refit: float | None) -> dict[str, Any]:
@@ -375,7 +356,7 @@ def _candidate(answer: Answer, row: ScoreRow, tests: ScoreTests, refit: float | 
         "would_explain": row.lm / max(float(tests.fit.residual @ tests.fit.residual), 1e-300),
         "tried_at": at,
         "log_bayes_factor": refit,
-        "named": any(step.name == row.name for step in answer.causes.steps),
+        "named": any(step.name == row.name for step in answer.steps),
         "cosines": [{"mechanism": name, "cosine": cosine} for cosine, name in sorted(alike, reverse=True)[:6]],
     }
 

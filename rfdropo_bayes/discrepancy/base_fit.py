@@ -126,7 +126,6 @@ def base_fits(
 def base_model(
     problem: AuditProblem,
     seed: int,
-    journal: Journal | None = None,
     report: Callable[[str], None] = lambda line: None,
     deadline: Deadline | None = None,
 ) -> tuple[FitTarget, Fit]:
@@ -135,7 +134,7 @@ def base_model(
     Raises:
         InputError: the time was up before the base model was fitted.
     """
-    begun = beginning(problem, first_target(problem, journal or Journal(), deadline))
+    begun = beginning(problem, first_target(problem, Journal(), deadline))
     try:
         *_, last = base_fits(problem, begun, seed, report)
     except OutOfTime:

@@ -100,7 +100,7 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
     shape alone changes the data, that change is the direction; otherwise the amplitudes are differentiated at the trial
     value.
     """
-    base = span(fit.jacobian)
+    base, coordinates = span(fit.jacobian), target.forward.coordinates
     open_ = [c for c in candidates if c.indices]
     indices = [i for c in open_ for i in c.indices]
     at_null = np.zeros((len(fit.residual), 0))
@@ -111,11 +111,18 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
     jobs: list[tuple[Candidate, dict[int, float]]] = []
     probes: list[Probe] = []
     for candidate in open_:
-        shapes = _shapes(target, candidate, {i: float(np.linalg.norm(column[i])) for i in candidate.indices})
+        unseen = [i for i in candidate.indices if np.linalg.norm(column[i]) < UNSEEN]
+        grids = {i: coordinates.space.parameters[i].spec.grid for i in unseen}
+        # If an amplitude has an effect, another amplitude without effect (a tilt about gravity itself) is no shape.
+        all_unseen = len(unseen) == len(candidate.indices)
+        shapes = [i for i in unseen if all_unseen or not coordinates.affine[i] or grids[i]]
         if not shapes:
             columns = np.stack([column[i] for i in candidate.indices], axis=1)
             probes.append(_probe(target, base, candidate, {}, columns, candidate.indices))
-        jobs += [(candidate, point) for point in _grid(target, candidate, shapes)]
+            continue
+        levels = LEVELS if len(shapes) < 2 else LEVELS_OF_TWO
+        values = [coordinates.encode_one(i, grids[i]) if grids[i] else coordinates.quantiles(i, levels) for i in shapes]
+        jobs += [(candidate, dict(zip(shapes, point, strict=True))) for point in product(*values)]
     return probes + _probe_grid(target, fit, base, jobs)
 
 
@@ -129,25 +136,6 @@ def score_test_rollouts(target: FitTarget, candidates: Sequence[Candidate]) -> i
         shapes = [len(p.spec.grid) for p in own if p.spec.grid]
         rollouts += touched * (forward.lanes.slope_rollouts * len(own) + int(np.prod(shapes)) * bool(shapes))
     return rollouts
-
-
-def _shapes(target: FitTarget, candidate: Candidate, size: dict[int, float]) -> list[int]:
-    """Parameters without effect at null that may have one elsewhere."""
-    coordinates = target.forward.coordinates
-    seen = [i for i in candidate.indices if size[i] >= UNSEEN]
-    unseen = [i for i in candidate.indices if size[i] < UNSEEN]
-    # If an amplitude has an effect, another amplitude without effect (a tilt about gravity itself) is no shape.
-    return [i for i in unseen if not seen or not coordinates.affine[i] or coordinates.space.parameters[i].spec.grid]
-
-
-def _grid(target: FitTarget, candidate: Candidate, shapes: Sequence[int]) -> list[dict[int, float]]:
-    coordinates = target.forward.coordinates
-    levels = LEVELS if len(shapes) < 2 else LEVELS_OF_TWO
-    values = []
-    for i in shapes:
-        given = coordinates.space.parameters[i].spec.grid
-        values.append(coordinates.encode_one(i, given) if given else coordinates.quantiles(i, levels))
-    return [dict(zip(shapes, point, strict=True)) for point in product(*values)] if shapes else []
 
 
 def _probe_grid(
@@ -165,7 +153,9 @@ def _probe_grid(
     slots = [(row, i) for row, (c, p) in enumerate(jobs) if not alone[row] for i in c.indices if i not in p]
     rows = np.array([row for row, _ in slots], dtype=int)
     directions = np.eye(points.shape[1])[[i for _, i in slots]] if slots else np.zeros((0, points.shape[1]))
-    slopes = target.recall("slopes", [points[rows], directions], lambda: _slopes(target, points[rows], directions))
+    slopes = target.recall(
+        "slopes", [points[rows], directions], lambda: {"slopes": target.slopes(points[rows], directions)[0]}
+    )
     probes = []
     for row, (candidate, point) in enumerate(jobs):
         if alone[row]:
@@ -175,10 +165,6 @@ def _probe_grid(
             if amplitudes:
                 probes.append(_probe(target, base, candidate, point, slopes["slopes"][rows == row].T, amplitudes))
     return probes
-
-
-def _slopes(target: FitTarget, points: np.ndarray, directions: np.ndarray) -> dict[str, np.ndarray]:
-    return {"slopes": target.slopes(points, directions)[0]}
 
 
 def _probe(
@@ -202,44 +188,32 @@ def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, F
     amplitude: its effect has a fixed size, and may be too large at the trial value. The path from its null value is
     searched, with places and times fixed if there is also a size.
     """
+    coordinates = target.forward.coordinates
     if len(probe.amplitudes) == 1:
-        drop, start, _ = _best_of(target, fit, _sizes(target, fit, probe))
+        (index,) = probe.amplitudes
+        sign = coordinates.one_sided[index]
+        sizes = SIZES * sign if sign else np.concatenate([-SIZES, SIZES])
+        points = np.repeat(fit.x[None], len(sizes), axis=0)
+        points[:, list(probe.point)] = list(probe.point.values())
+        points[:, index] = coordinates.null[index] + coordinates.prior_sd[index] * sizes
+        drop, start, _ = _best_of(target, fit, np.clip(points, *coordinates.bounds))
         return (drop, start) if drop > lm else (lm, probe.start(fit))
     if probe.amplitudes:
         return lm, probe.start(fit)
+    sized = [i for i in probe.point if coordinates.affine[i] and not coordinates.space.parameters[i].spec.grid]
     ladder = WAY
     while True:
-        drop, start, best = _best_of(target, fit, _on_the_way(target, fit, probe, ladder))
+        points = np.repeat(fit.x[None], len(ladder), axis=0)
+        for index, value in probe.point.items():
+            null = coordinates.null[index]
+            points[:, index] = null + ladder * (value - null) if index in sized or not sized else value
+        drop, start, best = _best_of(target, fit, np.clip(points, *coordinates.bounds))
         low, high = ladder[max(best - 1, 0)], ladder[min(best + 1, len(ladder) - 1)]
         # For a stop that cables seldom reach, a rung has no effect and the next far too much: the optimum lies between
         # them.
         if drop > NOTHING or high < NEIGHBOURS * low:
             return drop, start
         ladder = np.geomspace(low, high, len(WAY))
-
-
-def _on_the_way(
-    target: FitTarget, fit: Fit, probe: Probe, ladder: Float[np.ndarray, " way"]
-) -> Float[np.ndarray, "way d"]:
-    """A fit with a shape at some shares of the way from its null value to its trial value."""
-    coordinates = target.forward.coordinates
-    points = np.repeat(fit.x[None], len(ladder), axis=0)
-    sizes = [i for i in probe.point if coordinates.affine[i] and not coordinates.space.parameters[i].spec.grid]
-    for index, value in probe.point.items():
-        null = coordinates.null[index]
-        points[:, index] = null + ladder * (value - null) if index in sizes or not sizes else value
-    return np.clip(points, *coordinates.bounds)
-
-
-def _sizes(target: FitTarget, fit: Fit, probe: Probe) -> Float[np.ndarray, "way d"]:
-    """A fit's points with trial values of a probe's amplitude, of both signs if both are allowed."""
-    coordinates, (index,) = target.forward.coordinates, probe.amplitudes
-    null, sd, sign = coordinates.null[index], coordinates.prior_sd[index], coordinates.one_sided[index]
-    sizes = SIZES * sign if sign else np.concatenate([-SIZES, SIZES])
-    points = np.repeat(fit.x[None], len(sizes), axis=0)
-    points[:, list(probe.point)] = list(probe.point.values())
-    points[:, index] = null + sd * sizes
-    return np.clip(points, *coordinates.bounds)
 
 
 def _best_of(
@@ -257,20 +231,3 @@ def _best_of(
     step = np.linalg.lstsq(fit.jacobian, residuals[best], rcond=1e-6)[0]
     start[fit.free] += np.clip(step, -1.0, 1.0)
     return at_null - float(remaining[best]), start, best
-
-
-def discretisation_probe(
-    fit: Fit, name: str, finer: Float[np.ndarray, " n"], candidate_base: Float[np.ndarray, "n rank"]
-) -> Probe:
-    """The effect of a finer mesh and time step, from the residual of the finer simulator at the same point."""
-    columns = (fit.residual - finer)[:, None]
-    return Probe(name, {}, columns, (), signature(candidate_base, columns, 1))
-
-
-def fixed_drop(fit: Fit, probe: Probe) -> float:
-    """Drop of the sum of squares by a change without an amplitude, with base parameters refitted."""
-    base = span(fit.jacobian)
-    now, then = (
-        np.sum(project_out(base, r) ** 2) for r in (fit.residual[:, None], fit.residual[:, None] - probe.columns)
-    )
-    return float(now - then)

@@ -18,7 +18,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.bayes.batches import padded
-from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.priors import log_density
 from rfdropo_bayes.bayes.scopes import Scopes
 
@@ -97,7 +96,9 @@ class Coordinates:
 
     @cached_property
     def _scale(self) -> np.ndarray:
-        return np.array([_deviation(p, self._draws[p.name]) for p in self.space.parameters])
+        """Scale of each prior: its own if it has a scale, so that a half-normal at null is a standard normal's half."""
+        own = ((float(p.table.get("scale", 0.0)), self._draws[p.name]) for p in self.space.parameters)
+        return np.array([scale or float(np.std(draws)) or 1.0 for scale, draws in own])
 
     @property
     def _unit(self) -> np.ndarray:
@@ -249,8 +250,3 @@ class Coordinates:
             for i in np.flatnonzero((places >= 0) & added):  # deviation of a group's value from the shared value
                 theta[:, recording, places[i]] += values[:, i]
         return theta
-
-
-def _deviation(parameter: InferredParameter, draws: np.ndarray) -> float:
-    """Scale of the prior: its own if it has a scale, so that a half-normal at null is a standard normal's half."""
-    return float(parameter.table.get("scale", 0.0)) or float(np.std(draws)) or 1.0

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
-from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, Rules
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise, widened
 from rfdropo_bayes.discrepancy.gain import Gain
 from rfdropo_bayes.discrepancy.held_out import FittedModel, HeldOut, predicted, stages_of
@@ -39,7 +39,8 @@ class Described:
         gain: gain of the law on unseen recordings over the model without it; None without a law, or if the time was up.
         overall: the same over the base model.
         held_out: predictions of these recordings: by the base model, and last by the model with the law.
-        holds: whether unseen recordings clearly support the law.
+        holds: whether unseen recordings clearly support the law, and it explains a significant share of the
+            discrepancy.
     """
 
     search: LawResult
@@ -179,16 +180,11 @@ def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) 
         kept = supported or count
         gain, overall = held_out.gain(named, named + kept), held_out.gain(0, named + kept)
         seen = held_out.after(named + kept)
-        yield Described(law.cut(kept), model.steps, (), gain, overall, seen, holds_on(problem.rules, gain))
+        holds = bool(gain.clear and not gain.worse and gain.interval[0] > problem.rules.significant)
+        yield Described(law.cut(kept), model.steps, (), gain, overall, seen, holds)
         if count - supported >= UNSUPPORTED:
             report(f"unseen recordings do not support more than {supported} of {count} terms: the search ends")
             return
-
-
-def holds_on(rules: Rules, gain: Gain) -> bool:
-    """Whether a law holds on unseen recordings: they are clearly likelier with it, and it explains more than a share of
-    the discrepancy that is next to nothing."""
-    return bool(gain.clear and not gain.worse and gain.interval[0] > rules.significant)
 
 
 def coefficients(described: Described, seed: int) -> list[dict[str, Any]]:

@@ -6,24 +6,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from rfdropo_bayes.discrepancy.candidates import (
-    Candidate,
-    Probe,
-    discretisation_probe,
-    fixed_drop,
-    lead,
-    probe_all,
-    score_test_rollouts,
-)
+from rfdropo_bayes.discrepancy.candidates import Candidate, Probe, lead, probe_all, score_test_rollouts
 from rfdropo_bayes.discrepancy.deadline import about
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, best_between, heights, optimisation_rollouts, optimise
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.gain import noise_distance
 from rfdropo_bayes.discrepancy.inadequacy import as_measured, misspecified
 from rfdropo_bayes.discrepancy.omnibus import Omnibus
-from rfdropo_bayes.discrepancy.score import likeness, project_out, span
+from rfdropo_bayes.discrepancy.score import likeness, project_out, signature, span
 from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests, run_score_tests
 
 DISCRETISATION = "discretisation"
@@ -184,7 +176,8 @@ class ExtensionSearch:
             refined = replace(self.target, forward=self.finer)
             with clock.stage("finer mesh"):
                 finer = refined.recall("finer", [fit.x], lambda: {"left": refined.residual(fit.x[None])[0]})["left"]
-            probes.append(discretisation_probe(fit, DISCRETISATION, finer, span(fit.jacobian)))
+            change = (fit.residual - finer)[:, None]
+            probes.append(Probe(DISCRETISATION, {}, change, (), signature(span(fit.jacobian), change, 1)))
             names.append(DISCRETISATION)
         with clock.stage("joint test"):
             tests = run_score_tests(
@@ -196,7 +189,13 @@ class ExtensionSearch:
                 return tests
             seen = tests.row(DISCRETISATION).adjusted_p <= self.rules.family
             if seen and self._below_the_noise(fit):
-                exact = _without_numerical_error(fit, probes[-1])
+                # The simulation without its error in space and time, estimated from two resolutions. The change by
+                # halving the steps is a part of the error: half at first order of the time steps, three quarters at
+                # second order of the mesh. The error is therefore one to two times the change, as the data have it.
+                base, halved = span(fit.jacobian), probes[-1].columns
+                moved, left = project_out(base, halved)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
+                times = np.clip(float(moved @ left) / max(float(moved @ moved), 1e-300), 1.0, 2.0)
+                exact = fit.residual - times * halved[:, 0]
                 again = run_score_tests(
                     self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact
                 )
@@ -267,17 +266,23 @@ class ExtensionSearch:
         able = [row for row in tried.rows if tried.drops[row.name] > enough]
         # Candidates with equal signatures near null may differ at their fitted size.
         able = [row for row in able if gains.get(row.name, np.inf) > gains[best] - TOLD_APART]
-        members = self._class_of(tests.row(best), able)
+        mark = next(row.probe.mark for row in tried.rows if row.name == best and row.probe)
+        members = [best]
+        for row in able:
+            if row.name != best and row.probe and likeness(mark, row.probe.mark) > self.rules.class_cosine:
+                members.append(row.name)
         # A candidate of nearly equal gain is as likely a cause, for any signature.
-        members += tuple(n for n in worth if n not in members and gains[n] > gains[best] - self.rules.evidence)
+        members += [n for n in worth if n not in members and gains[n] > gains[best] - self.rules.evidence]
         fit_target = self.target.on(self.finer) if best == DISCRETISATION and self.finer else self.target
-        return Added(best, members, tests, tried.fits[best], gains[best], gains, fit_target)
+        return Added(best, tuple(members), tests, tried.fits[best], gains[best], gains, fit_target)
 
     def _lead(self, fit: Fit, row: ScoreRow) -> tuple[float, np.ndarray]:
         """See `lead`; a finer mesh has no parameter, and its effect only one size."""
         assert row.probe is not None
         if row.name == DISCRETISATION:
-            return fixed_drop(fit, row.probe), fit.x
+            base, residual = span(fit.jacobian), fit.residual[:, None]
+            now, then = (np.sum(project_out(base, each) ** 2) for each in (residual, residual - row.probe.columns))
+            return float(now - then), fit.x
         return lead(self.target, fit, row.probe, row.lm)
 
     def _leading(self, significant: Sequence[ScoreRow], drops: Mapping[str, float], fit: Fit) -> list[ScoreRow]:
@@ -298,27 +303,13 @@ class ExtensionSearch:
         chosen = [*heads, *rest][: self.rules.members]
         # A refit on a finer mesh costs as much as all others: only if it could win.
         chosen = [row for row in chosen if row.name != DISCRETISATION or drops[row.name] > 0.5 * drops[chosen[0].name]]
-        return sorted(chosen, key=lambda row: self._costly(row.name))
-
-    def _costly(self, name: str) -> bool:
-        """Whether rollouts with a candidate take longer than others."""
-        candidate = self.candidate(name)
-        if candidate is None:
-            return True
         costly, parameters = self.target.forward.lanes.costly, self.target.forward.coordinates.space.parameters
-        return any(parameters[index].physical in costly for index in candidate.indices)
 
-    def _class_of(self, best: ScoreRow, able: Sequence[ScoreRow]) -> tuple[str, ...]:
-        """The best candidate, and candidates of the same signature that explain the data equally well."""
-        assert best.probe is not None
-        alike = [
-            row.name
-            for row in able
-            if row.name != best.name
-            and row.probe is not None
-            and likeness(best.probe.mark, row.probe.mark) > self.rules.class_cosine
-        ]
-        return (best.name, *alike)
+        def slow(row: ScoreRow) -> bool:
+            candidate = self.candidate(row.name)
+            return candidate is None or any(parameters[index].physical in costly for index in candidate.indices)
+
+        return sorted(chosen, key=slow)
 
     def refit(self, fit: Fit, row: ScoreRow) -> Fit:
         """The model of a fit with a candidate in it."""
@@ -334,29 +325,25 @@ class ExtensionSearch:
         free = np.array([*fit.free, *np.setdiff1d(candidate.indices, fit.free)], dtype=int)
         start = best_between(self.target, fit.x, start, list(row.probe.point), SHARES)
         if len(candidate.indices) == 1:
-            refitted = self._optimised_from_all_sizes(candidate.indices[0], fit.x, start, free)
+            # From the best size of the prior, until no other size is better. The likelihood of a time shift has an
+            # optimum wherever jumps of commands meet the steps of the simulation or the rows of a recording; an
+            # optimisation from zero shift stops at one of them.
+            index = candidate.indices[0]
+            refitted = optimise(self.target, self._best_size(index, fit.x, start), free)
+            while True:
+                better = self._best_size(index, refitted.x, refitted.x)
+                if np.array_equal(better, refitted.x):
+                    break
+                again = optimise(self.target, better, free)
+                if again.log_evidence <= refitted.log_evidence:
+                    break
+                refitted = again
         else:
             refitted = optimise(self.target, start, free)
         # The model without the candidate is a special case: a worse result is a failed optimisation.
         if refitted.residual @ refitted.residual > fit.residual @ fit.residual:
             refitted = max(refitted, optimise(self.target, fit.x, free), key=lambda end: end.log_evidence)
         return refitted
-
-    def _optimised_from_all_sizes(
-        self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]
-    ) -> Fit:
-        """A fit with a candidate of one parameter, optimised from the best of its sizes until no other size is better.
-
-        The likelihood of a time shift has an optimum wherever jumps of commands meet the steps of the simulation or the
-        rows of a recording; an optimisation from zero shift stops at one of them.
-        """
-        fit = optimise(self.target, self._best_size(index, base, start), free)
-        while True:
-            better = self._best_size(index, fit.x, fit.x)
-            again = fit if np.array_equal(better, fit.x) else optimise(self.target, better, free)
-            if again.log_evidence <= fit.log_evidence:
-                return fit
-            fit = again
 
     def _best_size(
         self, index: int, base: Float[np.ndarray, " d"], start: Float[np.ndarray, " d"]
@@ -403,15 +390,3 @@ def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None
     moved = target.forward.observe_one(fit.x)["position"] - seen["position"][0]
     measured = target.measurements.channels[0].valid
     return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))
-
-
-def _without_numerical_error(fit: Fit, probe: Probe) -> Float[np.ndarray, " n"]:
-    """Residuals of the simulation without its error in space and time, estimated from two resolutions.
-
-    The change by halving the steps is a part of the error: half at first order of the time steps, three quarters at
-    second order of the mesh. The error is therefore one to two times the change; the data determine the factor.
-    """
-    base = span(fit.jacobian)
-    change, residual = project_out(base, probe.columns)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
-    share = np.clip(float(change @ residual) / max(float(change @ change), 1e-300), 1.0, 2.0)
-    return fit.residual - share * probe.columns[:, 0]

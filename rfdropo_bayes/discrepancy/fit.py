@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -30,8 +30,9 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.inference import LaplaceConfig, find_modes, maximise, normal_at, optimisation_cost
-from rfdropo_bayes.inference import Target as Climbed
+from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, find_modes
+from rfdropo_bayes.inference.modes.optimisation import maximise, normal_at, optimisation_cost
+from rfdropo_bayes.inference.modes.targets import Target as Climbed
 from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
@@ -389,42 +390,40 @@ def optimise(
     """Posterior mode over the free coordinates from one start, the others held."""
 
     def compute() -> Arrays:
-        stored = _optimise(target, start, free, evaluations)
-        return {part.name: np.asarray(getattr(stored, part.name)) for part in fields(Fit)}
+        posterior = Posterior(target, start, free)
+        optimised = posterior.whole()
+        low, high = optimised.bounds
+        state, _ = maximise(optimised, np.clip(start[free], low, high), max_steps=evaluations, tolerance=TOLERANCE)
+        u, approximation = state.position, normal_at(optimised, state)
+        residual, jacobian = optimised.linearise(u)
+        deviation = np.sqrt(np.diag(approximation.covariance))
+        # Only part of a peak at a bound is inside.
+        inside = np.log(np.maximum(norm.cdf((high - u) / deviation) - norm.cdf((low - u) / deviation), 1e-12))
+        slope, _ = optimised.quadratic(u)
+        slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
+        promise = 0.5 * float(slope @ approximation.covariance @ slope) if np.isfinite(state.log_density) else np.inf
+        evidence = approximation.log_evidence + float(np.sum(inside))
+        # Integrated over the size of a misspecified model's residuals; no change at the assumed size.
+        series = target.measurements.series(residual)
+        change = 0.0
+        for part, own in zip(target.noise.parts, target.measurements.columns, strict=True):
+            if part.source == MISFIT:
+                share = max(float(np.sum(series[..., own] ** 2)) / part.freedom, np.finfo(float).tiny)
+                change += 0.5 * part.freedom * (share - 1.0 - np.log(share))
+        evidence += change
+        return {
+            "x": posterior.place(u[None])[0],
+            "free": np.asarray(free),
+            "residual": np.asarray(residual),
+            "jacobian": np.asarray(-jacobian),
+            "covariance": np.asarray(approximation.covariance),
+            "log_evidence": np.asarray(evidence),
+            "promise": np.asarray(promise),
+        }
 
     stored = target.recall("optimise", [start, free, np.array(evaluations)], compute)
     numbers = {name: float(stored[name]) for name in ("log_evidence", "promise")}
     return Fit(**{**stored, **numbers})  # type: ignore[arg-type]
-
-
-def _optimise(target: FitTarget, start: np.ndarray, free: np.ndarray, evaluations: int) -> Fit:
-    """An optimisation, and the normal approximation at its end."""
-    posterior = Posterior(target, start, free)
-    optimised = posterior.whole()
-    low, high = optimised.bounds
-    state, _ = maximise(optimised, np.clip(start[free], low, high), max_steps=evaluations, tolerance=TOLERANCE)
-    u, approximation = state.position, normal_at(optimised, state)
-    residual, jacobian = optimised.linearise(u)
-    deviation = np.sqrt(np.diag(approximation.covariance))
-    # Only part of a peak at a bound is inside.
-    inside = np.log(np.maximum(norm.cdf((high - u) / deviation) - norm.cdf((low - u) / deviation), 1e-12))
-    slope, _ = optimised.quadratic(u)
-    slope = np.where(((u <= low) & (slope < 0)) | ((u >= high) & (slope > 0)), 0.0, slope)
-    promise = 0.5 * float(slope @ approximation.covariance @ slope) if np.isfinite(state.log_density) else np.inf
-    evidence = approximation.log_evidence + float(np.sum(inside)) + _over_sizes(target, residual)
-    return Fit(posterior.place(u[None])[0], free, residual, -jacobian, approximation.covariance, evidence, promise)
-
-
-def _over_sizes(target: FitTarget, residual: Float[np.ndarray, " n"]) -> float:
-    """Change of a log evidence [nat] by integrating over the size of a misspecified model's residuals; 0 at the assumed
-    size.
-    """
-    series, change = target.measurements.series(residual), 0.0
-    for part, own in zip(target.noise.parts, target.measurements.columns, strict=True):
-        if part.source == MISFIT:
-            share = max(float(np.sum(series[..., own] ** 2)) / part.freedom, np.finfo(float).tiny)
-            change += 0.5 * part.freedom * (share - 1.0 - np.log(share))
-    return change
 
 
 def optimisation_rollouts(target: FitTarget, parameters: int) -> int:

@@ -52,7 +52,10 @@ class Forward:
         self.deadline = deadline or Deadline()
         self.lanes = lanes
         self.coordinates = coordinates
-        self.commands = _cut(commands.of(list(chosen.values())), rows)
+        own = commands.of(list(chosen.values()))
+        observed = own.sample_step[:, :rows]
+        last = int(observed.max()) + 1  # an observation may lie between two steps
+        self.commands = Commands(own.initial, own.step[:, :last], observed, own.sample_fraction[:, :rows])
         self.recordings = tuple(chosen)
         self.slots = coordinates.slots(self.recordings)
         self.count = len(chosen)
@@ -220,10 +223,3 @@ class Forward:
         """Parameters (point, recording, physical), starts and commands of each lane."""
         lane = np.tile(np.arange(self.count), len(theta))
         return theta.reshape(-1, theta.shape[-1]), self.start[lane], self.commands.of(lane)
-
-
-def _cut(commands: Commands, rows: int | None) -> Commands:
-    """The first observations only, and the steps that lead to them."""
-    observed = commands.sample_step[:, :rows]
-    last = int(observed.max()) + 1  # an observation may lie between two steps
-    return Commands(commands.initial, commands.step[:, :last], observed, commands.sample_fraction[:, :rows])

@@ -183,12 +183,20 @@ def measure_gain(
         spread: deviation of the extended model's errors, for its bands; the noise's by default.
     """
     first, second = (np.where(unseen.valid, p.mean, 0.0) for p in (base, extended))
-    distances = np.array([_distances(unseen, errors) for errors in (first, second)])
-    own = [_elpd(unseen, p, noise_of_fit or noise) for p in (base, extended)]
-    difference = own[1] - own[0]
+    seen = unseen.valid[..., : unseen.markers].sum(axis=(1, 2))
+    markers = np.maximum(seen / 3.0, 1.0)
+    squares = (np.sum(errors[..., : unseen.markers] ** 2, axis=(1, 2)) for errors in (first, second))
+    distances = np.array([np.sqrt(square / markers) for square in squares])  # of a marker, root mean square
+    densities = []  # log predictive densities of each trajectory, up to the noise's normaliser
+    for prediction in (base, extended):
+        residual = np.where(unseen.valid, prediction.errors, 0.0)
+        white = unseen.under(noise_of_fit or noise).whiten(residual, unseen.valid)
+        densities.append(logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual)))
+    difference = densities[1] - densities[0]
     count = len(difference)
     explained, interval = explained_fraction(unseen, first, second, noise, pattern, rng)
-    seen = unseen.valid[..., : unseen.markers].sum(axis=(1, 2))
+    whole = np.sqrt(extended.errors.var(axis=0) + (noise.scale if deviation is None else deviation) ** 2)
+    z = (np.abs(extended.mean) / whole)[unseen.valid]
     rmse = np.sqrt(distances**2 @ seen / max(seen.sum(), 1))
     each = (Difference(*map(float, row)) for row in zip(*distances, difference, strict=True))
     return Gain(
@@ -197,18 +205,12 @@ def measure_gain(
         elpd_difference=float(difference.sum()),
         elpd_difference_se=float(np.sqrt(count) * difference.std(ddof=1)) if count >= DIFFERENCE_FROM else None,
         elpd_p=sign_flip_p(difference, rng) if count >= DIFFERENCE_FROM else None,
-        coverage=_coverage(unseen, extended, noise.scale if deviation is None else deviation),
+        coverage={level: float(np.mean(z < norm.ppf(0.5 + level / 2))) for level in LEVELS},
         explained=explained,
         interval=interval,
         floor=noise_distance(noise.first),
         differences=dict(zip(unseen.names, each, strict=True)),
     )
-
-
-def _distances(unseen: Unseen, errors: Float[np.ndarray, "trajectory time column"]) -> Float[np.ndarray, " trajectory"]:
-    """Root mean square distance of a marker [m], of each trajectory."""
-    markers = np.maximum(unseen.valid[..., : unseen.markers].sum(axis=(1, 2)) / 3.0, 1.0)
-    return np.sqrt(np.sum(errors[..., : unseen.markers] ** 2, axis=(1, 2)) / markers)
 
 
 def sign_flip_p(difference: Float[np.ndarray, " n"], rng: np.random.Generator) -> float:
@@ -230,19 +232,6 @@ def sign_flip_p(difference: Float[np.ndarray, " n"], rng: np.random.Generator) -
 def noise_distance(noise: Autoregression) -> float:
     """Root mean square distance of a marker that the noise of the positions alone makes [m]."""
     return float(np.sqrt(3.0 * np.mean(noise.scale**2)))
-
-
-def _elpd(unseen: Unseen, prediction: UnseenErrors, noise: Stacked) -> Float[np.ndarray, " trajectory"]:
-    """Log predictive density of each trajectory, up to the noise's normaliser."""
-    residual = np.where(unseen.valid, prediction.errors, 0.0)
-    white = unseen.under(noise).whiten(residual, unseen.valid)
-    return logsumexp(-0.5 * np.sum(white**2, axis=(-2, -1)), axis=0) - np.log(len(residual))
-
-
-def _coverage(unseen: Unseen, prediction: UnseenErrors, deviation: Float[np.ndarray, " column"]) -> dict[float, float]:
-    whole = np.sqrt(prediction.errors.var(axis=0) + deviation**2)
-    z = (np.abs(prediction.mean) / whole)[unseen.valid]
-    return {level: float(np.mean(z < norm.ppf(0.5 + level / 2))) for level in LEVELS}
 
 
 def explained_fraction(
@@ -267,7 +256,8 @@ def explained_fraction(
     sums, floors, drawn, expected = np.zeros((2, count)), np.zeros(count), np.zeros((RESAMPLES, 2)), np.zeros(RESAMPLES)
     for part, own in zip(unseen.under(noise).parts, noise.columns, strict=True):
         valid = unseen.valid[..., own]
-        axes = _components(pattern[..., own], valid.shape[-1])
+        flat = pattern[..., own].reshape(-1, valid.shape[-1])
+        axes = np.linalg.eigh(flat.T @ flat)[1]
         spectrum = _noise_power(part, base.shape[1])
         weight = _wiener(pattern[..., own] @ axes, base.shape[1]) ** 2 * spectrum[:, None]
         usable = np.maximum(valid.mean(axis=(1, 2)), 1e-9)
@@ -348,11 +338,6 @@ def _floor_error(noise: Autoregression, weight: Float[np.ndarray, " row"]) -> fl
         correlation = toeplitz(noise.autocorrelation[: noise.order])
         relative += deviation[-1] ** 2 * slope @ np.linalg.solve(correlation, slope)
     return float(np.sqrt(relative / noise.freedom))
-
-
-def _components(pattern: np.ndarray, channels: int) -> Float[np.ndarray, "channel channel"]:
-    flat = pattern.reshape(-1, channels)
-    return np.linalg.eigh(flat.T @ flat)[1]
 
 
 def _noise_power(noise: Autoregression, rows: int) -> Float[np.ndarray, " row"]:

@@ -19,7 +19,7 @@ from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, MISFIT, RESIDUALS
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
-from rfdropo_bayes.inference import lasting_series
+from rfdropo_bayes.inference.modes.lasting import lasting_series
 
 POOR = 2.0  # squared residual per value, in the noise's variance, above which a model is misspecified
 ROUNDS = 6  # of noise and fit in turn
@@ -94,11 +94,6 @@ def rewhitened(
 ) -> Float[np.ndarray, "*batch m"]:
     """Residuals under the white noise of ``fit_target``, in deviations of the noise of another target."""
     return other.measurements.whiten(_errors(fit_target, white), other.noise)
-
-
-def noise_updated(target: FitTarget, fit: Fit) -> tuple[FitTarget, Fit]:
-    """Target and fit of an improved model: if it was misspecified, refitted under noise of its present residuals."""
-    return (target, fit) if target.known is None else fit_with_noise(target.known, fit.x, fit.free)
 
 
 def noise_share(fit_target: FitTarget) -> float:

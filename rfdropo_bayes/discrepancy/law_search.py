@@ -21,16 +21,9 @@ from jaxtyping import Float
 from rfdropo_bayes.discrepancy.deadline import OutOfTime
 from rfdropo_bayes.discrepancy.differences import Groups
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
-from rfdropo_bayes.discrepancy.inadequacy import noise_updated
+from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.port_evidence import PortEvidence, evidences
-from rfdropo_bayes.discrepancy.port_responses import (
-    Responses,
-    feature_columns,
-    responses,
-    signal_sizes,
-    under,
-    with_exact_columns,
-)
+from rfdropo_bayes.discrepancy.port_responses import Responses, feature_columns, responses, under, with_exact_columns
 from rfdropo_bayes.discrepancy.port_rollouts import (
     EVERYWHERE,
     PREFIX,
@@ -326,7 +319,9 @@ class LawSearch:
         """
         known = target
         linear = responses(known, fit, self.ports, self.table, self.report)
-        values = self._values(linear)
+        values = self.table.over(linear.levels)  # of all features of the commands, then of the motion
+        if linear.of_motion is not None:
+            values = np.concatenate([values, linear.of_motion], axis=1)
         null = self._null(known, fit, linear)
         where = evidences(linear, null)
         centre = linear.basis.centre - linear.begun
@@ -351,14 +346,18 @@ class LawSearch:
                     break
                 ties = law.ties if terms else _tied(best, others)
                 best = self._shaped(known, terms, best)
-                fit_target, fit = noise_updated(best.target, best.fit)
+                fit_target, fit = best.target, best.fit
+                if fit_target.known is not None:  # misspecified so far: under noise of the present residuals
+                    fit_target, fit = fit_with_noise(fit_target.known, fit.x, fit.free)
                 anew = fit_target is not best.target
                 best = replace(best, target=fit_target, fit=fit)
                 linear, known = under(linear, known, fit_target), fit_target.on(target.forward)
                 linear = _relinearised(known, linear, fit)
                 null = self._null(known, fit, linear)
                 where = evidences(linear, null)
-                self._say(best, where[0])
+                law_words = f"{best.term.port.words}: {best.feature.formula(self.units[0])}{in_words(best.term.scope)}"
+                rest = f"{where[0].port.words} {where[0].log_evidence:.1f} nats"
+                self.report(f"law at {law_words}, score {best.score:.1f}; then {rest}")
                 if anew and not terms:
                     ties = _tied(best, [_under_noise_of(best, tie) for tie in ties])
                 law = replace(law, terms=[*terms, best], ties=ties, afterwards=[*law.afterwards, where[0]])
@@ -377,15 +376,6 @@ class LawSearch:
         chosen = [p for p in self.ports.ports if p.stage == "sensing" or p in leading]
         return with_exact_columns(known, fit, linear, {port: self._offered(port, values)[1] for port in chosen})
 
-    def _values(self, linear: Responses) -> Float[np.ndarray, "group feature row"]:
-        """All features of the commands, then of the motion."""
-        values = self.table.over(linear.levels)
-        return values if linear.of_motion is None else np.concatenate([values, linear.of_motion], axis=1)
-
-    def _has(self, port: Port, feature: Feature, group: str) -> bool:
-        """Whether a law of the model has this term."""
-        return bool(self.taken) and coefficient_name(port, feature, self.units[0], group) in self.taken
-
     def _features(self, port: Port) -> Sequence[Feature]:
         """Features of a law at a port, which on a body include the motion."""
         if self.ports.members(port) != (port,):
@@ -399,13 +389,8 @@ class LawSearch:
         place = {feature: k for k, feature in enumerate((*self.table.features, *self.table.of_motion))}
         own = [[place[f.of(m.number)] for m in self.ports.members(port)] for f in self._features(port)]
         signals = values[:, np.array(own)]
-        sizes = signal_sizes(signals)
+        sizes = np.sqrt(np.mean(signals**2, axis=(0, 2, 3)))  # root mean squares over all recordings
         return sizes, signals / np.maximum(sizes, 1e-300)[:, None, None]
-
-    def _say(self, best: Refit, where: PortEvidence) -> None:
-        names = self.units[0]
-        law = f"{best.term.port.words}: {best.feature.formula(names)}{in_words(best.term.scope)}"
-        self.report(f"law at {law}, score {best.score:.1f}; then {where.port.words} {where.log_evidence:.1f} nats")
 
     def _null(self, known: FitTarget, fit: Fit, linear: Responses) -> Float[np.ndarray, "draw n"]:
         """Whitened residuals of simulated data sets that lack nothing."""
@@ -443,7 +428,9 @@ class LawSearch:
                 for k in np.flatnonzero((gains[:, 0] > null_quantile) & (share >= LEAST)).tolist():
                     parts = (float(size[k] / sizes[k]), float(sd[k] / sizes[k]), float(sizes[k]))
                     row = TermGain(port, features[k], float(gains[k, 0]), float(share[k]), *parts, scope)
-                    if not had & {row.place, _of_any_shape(row.place)} and not self._has(*row.place):
+                    if had & {row.place, _of_any_shape(row.place)}:
+                        continue
+                    if not self.taken or coefficient_name(*row.place[:2], self.units[0], scope.group) not in self.taken:
                         rows.append(row)
         return sorted(rows, key=lambda row: -row.gain)
 
@@ -475,7 +462,9 @@ class LawSearch:
             residual = best.target.residual(without[None])[0]
             bare = replace(fit, x=without[:-1], free=fit.free[:-1], residual=residual, jacobian=fit.jacobian[:, :-1],
                            covariance=fit.covariance[:-1, :-1])  # fmt: skip
-            model = LinearModel(known, terms, bare, _relinearised(known, linear, bare), _precision(known, bare))
+            scale = _scale(known, bare)
+            precision = np.linalg.inv(bare.covariance / np.outer(scale, scale))  # of the posterior, in prior deviations
+            model = LinearModel(known, terms, bare, _relinearised(known, linear, bare), precision)
             ranked = self._ranked(model.responses, values, null_quantile, model.precision, terms)
             ranked = [row for row in ranked if row.place not in tried]
             fresh = self._confirmed(model, ranked, null_quantile, partial(fresh_terms, best=best.term, where=where))
@@ -640,12 +629,6 @@ def _scale(known: FitTarget, fit: Fit) -> Float[np.ndarray, " free"]:
     """Prior deviations of a fit's parameters; coefficients of laws have their own as a unit."""
     base = fit.free < len(known.forward.coordinates.names)
     return np.append(known.forward.coordinates.prior_sd[fit.free[base]], np.ones(np.count_nonzero(~base)))
-
-
-def _precision(known: FitTarget, fit: Fit) -> Float[np.ndarray, "free free"]:
-    """Posterior precision of a fit's parameters, in deviations of their priors."""
-    scale = _scale(known, fit)
-    return np.linalg.inv(fit.covariance / np.outer(scale, scale))
 
 
 def _relinearised(known: FitTarget, linear: Responses, fit: Fit) -> Responses:

@@ -12,7 +12,6 @@ from rfdropo_bayes.discrepancy.gain import noise_distance
 from rfdropo_bayes.discrepancy.inadequacy import POOR
 from rfdropo_bayes.discrepancy.law_search import Refit, in_words
 from rfdropo_bayes.discrepancy.pipeline import Answer
-from rfdropo_bayes.discrepancy.port_evidence import PortEvidence
 from rfdropo_bayes.discrepancy.prequential import span_in_words
 
 MILLIMETRES = 1e3
@@ -25,14 +24,9 @@ def channels_of(answer: Answer) -> tuple[str, ...]:
     return tuple(simulator.channel_names)
 
 
-def unknown_record(answer: Answer) -> dict[str, Any]:
-    """Unknown causes in audit.json."""
-    return {"ports": ports_record(answer), "law": law_record(answer)}
-
-
 def law_record(answer: Answer) -> dict[str, Any] | None:
     """The law that was found, whether it holds or not; None without a law."""
-    described = answer.causes.described
+    described = answer.described
     if described is None or described.last is None:
         return None
     gain, names = described.gain, channels_of(answer)
@@ -43,7 +37,15 @@ def law_record(answer: Answer) -> dict[str, Any] | None:
         "holds": described.holds,
         "beside": list(described.beside),
         "stands_in": list(described.stand_ins),
-        "ties": [_tie(tie, names) for tie in described.search.ties],
+        "ties": [
+            {
+                "port": tie.term.port.name,
+                "group": tie.term.scope.group,
+                "feature": tie.feature.formula(names),
+                "score": tie.score,
+            }
+            for tie in described.search.ties
+        ],
         "log_evidence_left": None if described.search.after is None else described.search.after.log_evidence,
         "rmse_before_mm": None if gain is None else MILLIMETRES * gain.rmse_base,
         "rmse_after_mm": None if gain is None else MILLIMETRES * gain.rmse_extended,
@@ -56,32 +58,26 @@ def law_record(answer: Answer) -> dict[str, Any] | None:
 
 def ports_record(answer: Answer) -> dict[str, Any] | None:
     """Every port with its evidence; None if not requested."""
-    described = answer.causes.described
+    described = answer.described
     if described is None:
         return None
     return {
-        "ports": [_port(row) for row in described.search.ports],
+        "ports": [
+            {
+                "port": row.port.name,
+                "log_evidence": row.log_evidence,
+                "adjusted_p": row.adjusted_p,
+                "amplitude": row.amplitude,
+                "unit": row.port.unit,
+                "memory_s": row.memory,
+                "explained_share": row.share,
+            }
+            for row in described.search.ports
+        ],
         "left_out": dict(described.search.map.left_out),
         "time_s": described.search.centre.tolist(),
         "null_quantile_nats": described.search.null_quantile,
     }
-
-
-def _port(row: PortEvidence) -> dict[str, Any]:
-    return {
-        "port": row.port.name,
-        "log_evidence": row.log_evidence,
-        "adjusted_p": row.adjusted_p,
-        "amplitude": row.amplitude,
-        "unit": row.port.unit,
-        "memory_s": row.memory,
-        "explained_share": row.share,
-    }
-
-
-def _tie(tie: Refit, names: Sequence[str]) -> dict[str, Any]:
-    place = {"port": tie.term.port.name, "group": tie.term.scope.group}
-    return {**place, "feature": tie.feature.formula(names), "score": tie.score}
 
 
 def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
@@ -165,7 +161,7 @@ def _ties(described: Described, names: Sequence[str]) -> str:
 
 def ports_sentence(answer: Answer) -> str:
     """Ports with an effect, in an audit without a supported law."""
-    described = answer.causes.described
+    described = answer.described
     if described is None or described.holds:
         return ""
     rows = described.search.significant(answer.problem.rules.family)
@@ -184,7 +180,7 @@ def ports_sentence(answer: Answer) -> str:
 
 def _no_law(answer: Answer) -> str:
     """Statement that no law is supported; for a law of the fitted recordings, its errors on unseen recordings."""
-    described = answer.causes.described
+    described = answer.described
     assert described is not None
     if described.last is None or described.gain is None:
         return "no law of it holds"

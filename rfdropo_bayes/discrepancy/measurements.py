@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.channels import Channel, Series, WeighedParts
-from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS, RESIDUALS, estimate_noise, steps_of
 from rfdropo_bayes.bayes.noise.stacked import Stacked, side_by_side
 from rfdropo_bayes.bayes.recordings import RecordingSet
@@ -136,21 +134,26 @@ class Measurements:
         estimates = []
         for index, own in enumerate(self.columns):
             model = None if like is None else like.parts[index]
-            options = {"source": source, "steps": steps, **_like(model, source)}
-            estimates.append(estimate_noise(departures[..., own], valid[..., own], share, **options))
+            shared = False if source == RESIDUALS else (None if model is None else model.correlation is not None)
+            order, pooled = (None, None) if model is None else (model.order, bool(np.ptp(model.scale) == 0.0))
+            estimates.append(
+                estimate_noise(
+                    departures[..., own],
+                    valid[..., own],
+                    share,
+                    source=source,
+                    steps=steps,
+                    order=order,
+                    pooled=pooled,
+                    shared=shared,
+                )
+            )
         return Stacked(tuple(estimates))
 
     @property
     def columns(self) -> list[slice]:
         """Columns of each channel."""
         return side_by_side([channel.valid.shape[-1] for channel in self.channels])
-
-
-def _like(like: Autoregression | None, source: str) -> dict[str, Any]:
-    """Order, pooling and sharing of an estimate: from an earlier estimate if there is one."""
-    shared = False if source == RESIDUALS else (None if like is None else like.correlation is not None)
-    order, pooled = (None, None) if like is None else (like.order, bool(np.ptp(like.scale) == 0.0))
-    return {"order": order, "pooled": pooled, "shared": shared}
 
 
 def gather_measurements(

@@ -102,7 +102,9 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
     clock, report, rules = search.target.forward.deadline, search.report, search.rules
     named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
     while True:
-        named = _with_own_noise(named)
+        if named.steps:  # the last model has the noise of its present residuals
+            fit_target, fit = fit_with_noise(named.fit_target.measured, named.fit.x, named.fit.free)
+            named = named.extended([*named.steps[:-1], replace(named.steps[-1], fit=fit, fit_target=fit_target)])
         tests = named.asked.score_tests(named.fit, named.names)
         named = replace(named, tests=tests)
         yield named
@@ -135,14 +137,6 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
             named = named.with_best()
             yield named
             named = without_needless_steps(named)
-
-
-def _with_own_noise(named: Named) -> Named:
-    """The last model with the noise of its present residuals."""
-    if not named.steps:
-        return named
-    fit_target, fit = fit_with_noise(named.fit_target.measured, named.fit.x, named.fit.free)
-    return named.extended([*named.steps[:-1], replace(named.steps[-1], fit=fit, fit_target=fit_target)])
 
 
 def without_needless_steps(named: Named) -> Named:

@@ -88,20 +88,13 @@ def joint_test(
     median.
     """
     pooled = {name: np.append(simulated[name], observed[name]) for name in observed}
-    ranks = {name: _upper_ranks(values) for name, values in pooled.items()}
-    each = np.stack(list(ranks.values()))
+    p_values, distances = {}, []  # of each statistic among all; from the median, in distances of the 95 % quantile
+    for name, values in pooled.items():
+        p_values[name] = (len(values) - np.searchsorted(np.sort(values), values, side="left")) / len(values)
+        middle, high = np.quantile(values, [0.5, 0.95])
+        distances.append((values - middle) / max(high - middle, 1e-300))
+    each = np.stack(list(p_values.values()))
     smallest = each.min(axis=0)
-    out = np.where(each == smallest, np.stack([_far_out(values) for values in pooled.values()]), -np.inf).max(axis=0)
+    out = np.where(each == smallest, np.stack(distances), -np.inf).max(axis=0)
     p = np.mean((smallest < smallest[-1]) | ((smallest == smallest[-1]) & (out >= out[-1])))
-    return Omnibus(float(p), {name: float(rank[-1]) for name, rank in ranks.items()}, blocks)
-
-
-def _far_out(values: np.ndarray) -> np.ndarray:
-    """Distances from the median, in units of the 95 % quantile's distance."""
-    middle, high = np.quantile(values, [0.5, 0.95])
-    return (values - middle) / max(high - middle, 1e-300)
-
-
-def _upper_ranks(values: np.ndarray) -> np.ndarray:
-    """p-value of each statistic among all of them."""
-    return (len(values) - np.searchsorted(np.sort(values), values, side="left")) / len(values)
+    return Omnibus(float(p), {name: float(rank[-1]) for name, rank in p_values.items()}, blocks)

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import INNOVATIONS, RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.cautions import Caution
@@ -83,25 +82,6 @@ class Results:
 
 
 @dataclass(frozen=True)
-class Causes:
-    """Result of the search over extensions.
-
-    Attributes:
-        steps: steps supported by unseen recordings; all steps if none is supported.
-        unsupported: mechanisms supported by fitted but not by unseen recordings.
-        test_series: score tests of the base model, and after each step.
-        refits: log Bayes factors of candidates refitted beside the last model but not added.
-        described: effect that the library lacks; None if no misfit was left.
-    """
-
-    steps: list[Added]
-    unsupported: list[str]
-    test_series: list[ScoreTests]
-    refits: dict[str, float] = field(default_factory=dict)
-    described: Described | None = None
-
-
-@dataclass(frozen=True)
 class Validation:
     """Gain of the extension on recordings that no fit has seen.
 
@@ -143,24 +123,6 @@ class Validation:
 
 
 @dataclass(frozen=True)
-class Doubts:
-    """Doubts about the noise or the simulation.
-
-    Attributes:
-        suspected: a noise under which the base model would pass, if the stated noise leaves an unexplained discrepancy.
-        shift: constant distance between repeats [m]; None without repeats.
-        numerical: motion of the last model's markers by half the time step and a finer mesh [m]; None if unknown, or if
-            the finer simulator is used.
-        priors: parameters of the base model determined by their prior.
-    """
-
-    suspected: Stacked | None
-    shift: float | None
-    numerical: float | None
-    priors: list[Caution]
-
-
-@dataclass(frozen=True)
 class Cost:
     """Cost of an audit.
 
@@ -193,21 +155,38 @@ class Answer:
         problem: the audited problem.
         target: data, noise of the measurement, and simulator.
         base: fit of the base model.
-        causes, validation, doubts, cost: see their own classes.
+        steps: steps supported by unseen recordings; all steps if none is supported.
+        unsupported: mechanisms supported by fitted but not by unseen recordings.
+        test_series: score tests of the base model, and after each step.
+        refits: log Bayes factors of candidates refitted beside the last model but not added.
+        described: effect that the library lacks; None if no misfit was left.
+        validation, cost: see their own classes.
         remainder: the residual that no candidate explains.
         sizes: the last model's fit under widened priors; the source of ``draws``.
+        suspected: a noise under which the base model would pass, if the stated noise leaves an unexplained discrepancy.
+        shift: constant distance between repeats [m]; None without repeats.
+        numerical: motion of the last model's markers by half the time step and a finer mesh [m]; None if unknown, or if
+            the finer simulator is used.
+        priors: cautions on parameters of the base model determined by their prior.
     """
 
     verdict: str
     problem: AuditProblem
     target: FitTarget
     base: Fit
-    causes: Causes
+    steps: list[Added]
+    unsupported: list[str]
+    test_series: list[ScoreTests]
+    refits: dict[str, float]
+    described: Described | None
     validation: Validation
     remainder: Remainder
     sizes: Fit
     draws: Float[np.ndarray, "draw d"]
-    doubts: Doubts
+    suspected: Stacked | None
+    shift: float | None
+    numerical: float | None
+    priors: list[Caution]
     cost: Cost
 
     @property
@@ -223,13 +202,12 @@ class Answer:
     @property
     def extended(self) -> Fit:
         """The last model."""
-        return self.causes.steps[-1].fit if self.causes.steps else self.base
+        return self.steps[-1].fit if self.steps else self.base
 
     @property
     def law(self) -> Described | None:
         """The adopted law; None without an adopted law."""
-        described = self.causes.described
-        return described if described is not None and described.holds else None
+        return self.described if self.described is not None and self.described.holds else None
 
     @property
     def adopted(self) -> list[Added]:
@@ -237,7 +215,7 @@ class Answer:
         gain = self.validation.gain
         if self.law is not None:
             gain = self.validation.gain or self.law.gain
-        return self.causes.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
+        return self.steps if gain is not None and gain.clear and self.verdict != UNEXPLAINED else []
 
 
 def audit(
@@ -278,12 +256,15 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
             results = replace(results, reached=reached)
             yield results
     target, base = results.reached.settled()
-    problem = _with_differences_of(begun.problem, target)
+    problem, step = begun.problem, target.forward.lanes.difference
+    if step is not None and step != problem.lanes.difference:  # steps that the base fit has found usable
+        finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
+        problem = replace(problem, lanes=target.forward.lanes, finer=finer)
     results = replace(results, problem=problem).after(BASE)
-    report(f"base model fitted; {_noise(target.measured.noise.first)}{_misspecified(target, base)}")
+    report(f"base model fitted; {_noise_in_words(target, base)}")
     firsts = [group[0] for group in target.measurements.members]
-    finer = simulated(problem, True, target.measurements, firsts, clock) if problem.finer else None
-    search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, finer, report)
+    refined = simulated(problem, True, target.measurements, firsts, clock) if problem.finer else None
+    search = ExtensionSearch(target, problem.candidates, problem.rules, problem.seed, refined, report)
     named = Named(search, base)
     for each in _named(named):
         named, results = each, replace(results, named=each)
@@ -294,14 +275,23 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
         kept, results = each_kept, replace(results, kept=each_kept)
         yield results
     last = kept.named
-    if last.steps and last.fit_target.noise.source == RESIDUALS:
-        kept = replace(kept, named=replace(last, tests=_final_score_tests(last)))
+    if last.steps and last.fit_target.noise.source == RESIDUALS:  # tested under the noise that it leaves itself
+        renewed = replace(last.fit_target, noise=residual_noise(last.fit_target, last.fit))
+        fit = optimise(renewed, last.fit.x, last.fit.free)
+        tests = last.asked.under(renewed).score_tests(fit, last.names)
+        report(f"joint test under the noise that it leaves: p {p_in_words(tests.omnibus.p, problem.rules.bootstraps)}")
+        kept = replace(kept, named=replace(last, tests=tests))
     results = replace(results, kept=kept).after(GAIN)
     yield results
     verdict = _verdict(kept, problem, ended=True)
     passes = kept.named.test_series[-1].omnibus.p > problem.rules.extended_passes
     if verdict in (PARTLY, UNEXPLAINED) and not passes:
-        results = replace(results, suspected=_suspected(search, as_measured(last.search.target, last.base)))
+        stated = search.target.measured
+        if stated.noise.source == STATED:  # would the base model pass under a noise fitted to its residuals?
+            other, fit = under_residual_noise(stated, as_measured(last.search.target, last.base))
+            p = search.under(other).score_tests(fit).omnibus.p
+            passing = p > problem.rules.base_passes and not other.noise.doubtful
+            results = replace(results, suspected=other.noise if passing else None)
         yield results
     # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that
     # passes the joint test leaves nothing to describe, even if the explained fraction is uncertain.
@@ -346,22 +336,27 @@ def conclude(results: Results, report: Callable[[str], None] = lambda line: None
         size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
         verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
     draws = sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds)
-    suspected = None if verdict == DESCRIBED else results.suspected
     rollouts = fit_target.forward.rollouts + (finer.rollouts if finer else 0)
+    why, unfinished = (clock.why, results.unfinished) if stopped else ("", ())
     return Answer(
         verdict,
         problem,
         target,
         base,
-        Causes(steps, list(kept.unsupported), test_series, fitted.gains, described),
+        steps,
+        list(kept.unsupported),
+        test_series,
+        fitted.gains,
+        described,
         validation,
         remainder,
         sizes,
         draws,
-        Doubts(suspected, target.measurements.shift, shown, decided_by_priors(target, draws)),
-        Cost(
-            clock.why if stopped else "", results.unfinished if stopped else (), rollouts, clock.profile, clock.waited
-        ),
+        suspected=None if verdict == DESCRIBED else results.suspected,
+        shift=target.measurements.shift,
+        numerical=shown,
+        priors=decided_by_priors(target, draws),
+        cost=Cost(why, unfinished, rollouts, clock.profile, clock.waited),
     )
 
 
@@ -371,7 +366,8 @@ def _kept_in_time(results: Results, clock: Deadline) -> Kept:
     """
     named = results.named
     if named is None:
-        target, base = _settled(results.reached, clock)
+        with clock.granted(float("inf")):
+            target, base = results.reached.settled()
         named = Named(
             ExtensionSearch(target, results.problem.candidates, results.problem.rules, results.problem.seed), base
         )
@@ -383,12 +379,6 @@ def _kept_in_time(results: Results, clock: Deadline) -> Kept:
     with suppress(OutOfTime), clock.granted():
         kept = next(iter(keep_supported(results.problem, named)))
     return kept
-
-
-def _settled(reached: Reached, clock: Deadline) -> tuple[FitTarget, Fit]:
-    """Target and fit of a base model that was not fitted to the end."""
-    with clock.granted(float("inf")):
-        return reached.settled()
 
 
 def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
@@ -426,47 +416,17 @@ def _named(begun: Named) -> Iterator[Named]:
     yield again
 
 
-def _with_differences_of(problem: AuditProblem, target: FitTarget) -> AuditProblem:
-    """The problem with derivatives over the steps that the base fit has found usable."""
-    step = target.forward.lanes.difference
-    if step is None or step == problem.lanes.difference:
-        return problem
-    finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
-    return replace(problem, lanes=target.forward.lanes, finer=finer)
-
-
-def _noise(noise: Autoregression) -> str:
-    """Phrase about a noise for progress reports."""
+def _noise_in_words(target: FitTarget, fit: Fit) -> str:
+    """Phrase about the noise, and about a misspecified model, for progress reports."""
+    noise = target.measured.noise.first
     shared = "" if noise.correlation is None else ", shared between coordinates"
-    return f"noise from {noise.source}, AR({noise.order}){shared}"
-
-
-def _misspecified(target: FitTarget, fit: Fit) -> str:
-    """Phrase about a misspecified model for progress reports."""
+    words = f"noise from {noise.source}, AR({noise.order}){shared}"
     if target.known is None:
-        return ""
-    noise, own = target.noise.first.scale, target.measurements.columns[0]
-    deviation = residual_deviation(target, fit)[own]
-    size, share = 1e3 * np.sqrt(3.0 * np.mean(deviation**2)), float(np.mean((deviation / noise) ** 2))
-    return f"; it is misspecified: white noise of {size:.2g} mm, the size of its residuals; a row counts {share:.2g}"
-
-
-def _final_score_tests(last: Named) -> ScoreTests:
-    """The tests of the extended model under the noise that it leaves itself."""
-    renewed = replace(last.fit_target, noise=residual_noise(last.fit_target, last.fit))
-    fit = optimise(renewed, last.fit.x, last.fit.free)
-    tests = last.asked.under(renewed).score_tests(fit, last.names)
-    p = p_in_words(tests.omnibus.p, last.search.rules.bootstraps)
-    last.search.report(f"joint test under the noise that it leaves: p {p}")
-    return tests
-
-
-def _suspected(search: ExtensionSearch, base: Fit) -> Stacked | None:
-    """Noise fitted to the base model's residuals, if the model passes under it but not under the stated noise."""
-    known = search.target.measured
-    if known.noise.source != STATED:
-        return None
-    target, fit = under_residual_noise(known, base)
-    tests = search.under(target).score_tests(fit)
-    passes = tests.omnibus.p > search.rules.base_passes and not target.noise.doubtful
-    return target.noise if passes else None
+        return words
+    deviation = residual_deviation(target, fit)[target.measurements.columns[0]]
+    size, share = (
+        1e3 * np.sqrt(3.0 * np.mean(deviation**2)),
+        float(np.mean((deviation / target.noise.first.scale) ** 2)),
+    )
+    white = f"white noise of {size:.2g} mm, the size of its residuals"
+    return f"{words}; it is misspecified: {white}; a row counts {share:.2g}"

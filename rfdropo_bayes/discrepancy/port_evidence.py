@@ -65,17 +65,14 @@ class Decomposed:
         return 0.5 * (square / variance) @ c - 0.5 * np.sum(np.log(variance), axis=1)[:, None]
 
 
-def evidences(
-    linear: Responses, null: Float[np.ndarray, "draw n"], chosen: Sequence[Port] | None = None
-) -> list[PortEvidence]:
+def evidences(linear: Responses, null: Float[np.ndarray, "draw n"]) -> list[PortEvidence]:
     """Evidence of every port, the largest first.
 
     Args:
-        found: responses of the model.
+        linear: responses of the model.
         null: whitened residuals of simulated data sets without discrepancy.
-        chosen: ports to test; all by default.
     """
-    base, ports = linear.base, list(linear.whitened) if chosen is None else list(chosen)
+    base, ports = linear.base, list(linear.whitened)
     residual = project_out(base, linear.residual.reshape(-1)[:, None])[:, 0]
     data = np.concatenate([residual[:, None], null.T[: len(residual)]], axis=1)
     kernels = [np.exp(-np.abs(np.subtract.outer(linear.basis.centre, linear.basis.centre)) / m) for m in MEMORIES]
@@ -83,7 +80,9 @@ def evidences(
     best, every = {}, np.zeros((len(ports), data.shape[1]))
     for k, port in enumerate(ports):
         parts = _decomposed(linear, base, port, roots)
-        projected = _project(linear, port, data)
+        response = port.size * linear.whitened[port]
+        series = data.reshape(*linear.residual.shape, -1)  # whose base parameters are projected out already
+        projected = np.concatenate([part.T @ own for part, own in zip(response, series, strict=True)])  # Phi'y
         gains = np.stack([part.gains(projected) for part in parts])  # memory, size, data
         every[k] = np.maximum(gains.max(axis=(0, 1)), 0.0)
         place = np.unravel_index(int(np.argmax(gains[:, :, 0])), gains.shape[:2])
@@ -92,20 +91,19 @@ def evidences(
     rows = []
     for k, port in enumerate(ports):
         part, size, memory, projected = best[port]
-        mean, sd, share = _signal(part, size, projected, linear.residual.shape[0], excess)
+        lam, c = part.eigenvalues, part.root.T @ projected
+        variance = 1.0 + size**2 * lam
+        g = size**2 * c / variance
+        freedom = float(np.sum(size**2 * lam / variance))
+        share = (2.0 * float(g @ c) - float(g @ (lam * g)) - freedom) / max(excess, 1e-300) if excess > 0.0 else 0.0
+        mean = (part.root @ g).reshape(linear.residual.shape[0], -1)
+        sd = np.sqrt(np.sum(part.root**2 * (size**2 / variance), axis=1)).reshape(mean.shape)
         rms = float(np.sqrt(np.mean(mean**2)))
         rows.append(
             PortEvidence(port, float(every[k, 0]), tail(every[k, 0], most), port.size * rms, memory, share,
                          port.size * mean, port.size * sd)
         )  # fmt: skip
     return sorted(rows, key=lambda row: -row.log_evidence)
-
-
-def _project(linear: Responses, port: Port, data: Float[np.ndarray, "n data"]) -> Float[np.ndarray, "coefficient data"]:
-    """Phi'y of every data set, whose base parameters are projected out already, in sizes of the port."""
-    response = port.size * linear.whitened[port]
-    series = data.reshape(*linear.residual.shape, -1)
-    return np.concatenate([part.T @ own for part, own in zip(response, series, strict=True)])
 
 
 def _decomposed(
@@ -125,17 +123,3 @@ def _decomposed(
         values, vectors = np.linalg.eigh(whole.T @ gram @ whole)
         parts.append(Decomposed(whole @ vectors, np.maximum(values, 0.0)))
     return parts
-
-
-def _signal(
-    part: Decomposed, size: float, projected: Float[np.ndarray, " coefficient"], groups: int, excess: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Mean and deviation of the signal in sizes of the port, and the share of the discrepancy that it explains."""
-    lam, c = part.eigenvalues, part.root.T @ projected
-    variance = 1.0 + size**2 * lam
-    g = size**2 * c / variance
-    freedom = float(np.sum(size**2 * lam / variance))
-    share = (2.0 * float(g @ c) - float(g @ (lam * g)) - freedom) / max(excess, 1e-300) if excess > 0.0 else 0.0
-    mean = (part.root @ g).reshape(groups, -1)
-    sd = np.sqrt(np.sum(part.root**2 * (size**2 / variance), axis=1)).reshape(groups, -1)
-    return mean, sd, share

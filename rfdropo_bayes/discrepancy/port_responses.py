@@ -160,7 +160,8 @@ def _response(
         if port.stage == "sensing":
             shift = shown["offset"][lane][:, None, None]
             still = shown["position"][lane] - shift
-            parts = {"position": as_sensed(acting, still, commands, _time_step(forward)) + shift}
+            time_step: Any = forward.lanes.simulator.description["time_step_s"]
+            parts = {"position": as_sensed(acting, still, commands, float(time_step)) + shift}
         else:
             theta = forward.coordinates.physical_values(fit.x[None], forward.slots)[0]
             commands = commands._replace(signals=signals_of(ports, acting))
@@ -210,10 +211,6 @@ def under(linear: Responses, fit_target: FitTarget, other: FitTarget) -> Respons
     return replace(linear, whitened=whitened, exact=exact, noise=noise_share(other))
 
 
-def _time_step(forward: Any) -> float:
-    return float(forward.lanes.simulator.description["time_step_s"])
-
-
 def on_splines(basis: Splines, values: Float[np.ndarray, "*batch row"]) -> Float[np.ndarray, "*batch spline"]:
     """Coefficients of the splines that come nearest to series over the steps."""
     return values @ basis.inverse.T
@@ -227,8 +224,3 @@ def feature_columns(
         return linear.exact[port]
     near = np.moveaxis(on_splines(linear.basis, features), 1, 3)  # group, member, spline, feature
     return sum(linear.whitened[member] @ near[:, k] for k, member in enumerate(linear.ports.members(port)))
-
-
-def signal_sizes(features: Float[np.ndarray, "group feature member row"]) -> Float[np.ndarray, " feature"]:
-    """Root mean square of features over all recordings."""
-    return np.sqrt(np.mean(features**2, axis=(0, 2, 3)))

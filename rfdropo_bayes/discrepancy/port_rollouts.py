@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
 from rfdropo_bayes.bayes.lanes import STEP, Fields, Lanes
 from rfdropo_bayes.bayes.scopes import build_scopes
-from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Forward, Points
 from rfdropo_bayes.discrepancy.journal import digest
 from rfdropo_bayes.mechanisms.default_priors import normal
@@ -212,7 +211,9 @@ class PortedForward(Forward):
     def __init__(self, forward: Forward, ports: PortMap, table: FeatureTable, terms: Sequence[PlacedTerm]) -> None:
         self.__dict__.update({k: v for k, v in forward.__dict__.items() if k != "identity"})
         self.plain, self.ports, self.table, self.terms = forward, ports, table, tuple(terms)
-        self.coordinates = with_terms(forward.coordinates, terms)
+        specs = [spec for term in terms for spec in term.specs]  # measured from null in prior deviations
+        further = build_scopes(specs, {spec.name: {} for spec in specs}, {}, ())
+        self.coordinates = forward.coordinates.with_further(further)
         added = np.full((len(forward.slots), len(self._own)), -1)
         self.slots = np.concatenate([forward.slots, added], axis=1)
         self.forget()
@@ -302,13 +303,6 @@ def with_laws_of(own: Forward, forward: Forward) -> Forward:
         return forward
     table = own.table if forward.lanes is own.table.lanes else FeatureTable(forward.lanes, own.table.features)
     return own.instead_of(forward, table)
-
-
-def with_terms(coordinates: Coordinates, terms: Sequence[PlacedTerm]) -> Coordinates:
-    """Coordinates with the coefficients of laws after all others; measured from null in prior deviations."""
-    specs = [spec for term in terms for spec in term.specs]
-    added = build_scopes(specs, {spec.name: {} for spec in specs}, {}, ())
-    return coordinates.with_further(added)
 
 
 def placed(

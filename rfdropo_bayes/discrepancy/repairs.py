@@ -15,14 +15,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from rfdropo_bayes.discrepancy.candidates import start_together
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, WIDER, Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import Fit, best_between, heights, optimise
 from rfdropo_bayes.discrepancy.inadequacy import misspecified
 from rfdropo_bayes.discrepancy.score import joint_statistic
-from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
+from rfdropo_bayes.discrepancy.score_tests import ScoreTests
 
 PAIRS = 3  # that are refitted
 
@@ -56,7 +55,11 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
     leading = sorted((p for p in drops if drops[p] > taken + 2.0 * worth), key=lambda p: -drops[p])[:PAIRS]
     fits = {}
     for names in leading:
-        fits[names] = _refit_pair(search, fit, [rows[name] for name in names])
+        probes = [probe for name in names if (probe := rows[name].probe)]
+        constant = [index for probe in probes for index in probe.point]
+        added = np.concatenate([c.indices for c in search.candidates if c.name in names])
+        start = best_between(target, fit.x, start_together(fit, probes), constant, SHARES)
+        fits[names] = optimise(target, start, np.array([*fit.free, *np.setdiff1d(added, fit.free)]))
         gained = fits[names].log_evidence - fit.log_evidence
         search.report(f"refit with {' and '.join(names)}: log Bayes factor {gained:.1f}")
     if not fits:
@@ -73,15 +76,6 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         Added(first, (first,), tests, alone[first], gains[0], single.refits if single else {}, target),
         Added(second, (second,), between, fits[best], gains[1], {}, target),
     ]
-
-
-def _refit_pair(search: ExtensionSearch, fit: Fit, rows: Sequence[ScoreRow]) -> Fit:
-    """The model of a fit with two candidates in it."""
-    probes = [row.probe for row in rows if row.probe is not None]
-    chosen = [c.indices for c in search.candidates if c.name in [row.name for row in rows]]
-    constant = [index for probe in probes for index in probe.point]
-    start = best_between(search.target, fit.x, start_together(fit, probes), constant, SHARES)
-    return optimise(search.target, start, np.array([*fit.free, *np.setdiff1d(np.concatenate(chosen), fit.free)]))
 
 
 def optimised_again(search: ExtensionSearch, step: Added) -> Fit | None:
@@ -114,7 +108,10 @@ def without_needless(search: ExtensionSearch, base: Fit, steps: Sequence[Added])
         gone = np.setdiff1d(steps[index].fit.free, before.free)
         emptied = last.fit.x.copy()
         emptied[gone] = null[gone]
-        if _nats_to(last.fit, emptied, gone) > TOLD_APART:
+        place = [int(np.flatnonzero(last.fit.free == index)[0]) for index in gone]
+        apart = last.fit.x[gone] - emptied[gone]
+        covariance = last.fit.covariance[np.ix_(place, place)]
+        if 0.5 * float(apart @ np.linalg.solve(covariance, apart)) > TOLD_APART:  # the least loss [nat]
             continue
         if optimise(last.fit_target, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
             search.report(f"{steps[index].name} is no longer needed")
@@ -136,10 +133,3 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
         fit_targets.append(step.fit_target)
         kept.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
     return tuple(kept)
-
-
-def _nats_to(fit: Fit, point: Float[np.ndarray, " d"], moved: Int[np.ndarray, " moved"]) -> float:
-    """Least loss [nat] of a model with some coordinates fixed at a point, by the fit's normal approximation."""
-    place = [int(np.flatnonzero(fit.free == index)[0]) for index in moved]
-    apart = fit.x[moved] - point[moved]
-    return 0.5 * float(apart @ np.linalg.solve(fit.covariance[np.ix_(place, place)], apart))

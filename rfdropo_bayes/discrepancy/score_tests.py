@@ -108,26 +108,20 @@ def run_score_tests(
         white = target.measurements.series(residual)
         blocks = block_squares(white, target.measurements.valid)
         tests.append(joint_test({name: float(v[index]) for name, v in observed.items()}, simulated, blocks))
-    rows = [_row(name, seen, surprises[0], most, fit) for name in names]
+    rows = []
+    for name in names:
+        own = [i for i, probe in enumerate(seen) if probe.candidate == name]
+        if not own:
+            rows.append(ScoreRow(name, None, 0.0, 0, 1.0, 1.0, -np.inf))
+            continue
+        best = max(own, key=lambda i: surprises[0, i])
+        surprise, probe = surprises[0, best], seen[best]
+        lm, rank = float(statistic(probe.mark, fit.residual)[0]), probe.mark.rank
+        p = max(float(np.exp(-surprise)), float(np.finfo(float).tiny))  # no p-value is zero
+        rows.append(ScoreRow(name, probe, lm, rank, p, tail(surprise, most), lm - rank * np.log(fit.counted)))
     return ScoreTests(
         fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None
     )
-
-
-def _row(name: str, seen: Sequence[Probe], surprises: np.ndarray, most: np.ndarray, fit: Fit) -> ScoreRow:
-    own = [i for i, probe in enumerate(seen) if probe.candidate == name]
-    if not own:
-        return ScoreRow(name, None, 0.0, 0, 1.0, 1.0, -np.inf)
-    best = max(own, key=lambda i: surprises[i])
-    probe = seen[best]
-    lm = float(statistic(probe.mark, fit.residual)[0])
-    score = lm - probe.mark.rank * np.log(fit.counted)
-    return ScoreRow(name, probe, lm, probe.mark.rank, _p_value(surprises[best]), tail(surprises[best], most), score)
-
-
-def _p_value(surprise: float) -> float:
-    """Never zero, which no p-value is: the smallest number that is left."""
-    return max(float(np.exp(-surprise)), float(np.finfo(float).tiny))
 
 
 def _statistics(
@@ -173,7 +167,12 @@ def null_residuals(
     residuals = np.empty((count, len(base)))
     drawn = noise.at(measurements.single_steps).draw(rng, (count, *measurements.departures.shape))
     if noise.source == RESIDUALS:
-        drawn = _fitted(measurements, noise, base, drawn)
+        # Estimated from residuals of the base model, as for the data: noise before a fit is slightly larger.
+        order = [group[0] for group in measurements.members]
+        white, rows = measurements.whiten(drawn[:, order], noise), base[: measurements.count.size]
+        left = (white - white @ rows @ rows.T).reshape(count, *measurements.count.shape)
+        drawn = np.empty_like(drawn)
+        drawn[:, order] = noise.at(measurements.steps).colour(left, measurements.valid)
     for row, single in enumerate(drawn):
         estimated = noise
         if noise.source not in (STATED, MISFIT):
@@ -182,19 +181,6 @@ def null_residuals(
     weighed = measurements.size - measurements.count.size  # whose errors are known
     residuals[:, measurements.count.size :] = rng.standard_normal((count, weighed))
     return project_out(base, residuals.T).T
-
-
-def _fitted(measurements: Measurements, noise: Stacked, base: np.ndarray, drawn: np.ndarray) -> np.ndarray:
-    """Residuals of the base model for data sets without repeats. If the noise is estimated from residuals, it is also
-    estimated from residuals here, because noise before a fit is slightly larger.
-    """
-    order = [group[0] for group in measurements.members]
-    white = measurements.whiten(drawn[:, order], noise)
-    rows = base[: measurements.count.size]
-    residuals = (white - white @ rows @ rows.T).reshape(len(drawn), *measurements.count.shape)
-    fitted = np.empty_like(drawn)
-    fitted[:, order] = noise.at(measurements.steps).colour(residuals, measurements.valid)
-    return fitted
 
 
 def tail(observed: float, simulated: Float[np.ndarray, " count"]) -> float:

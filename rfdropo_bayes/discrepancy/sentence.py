@@ -32,7 +32,7 @@ def sentence(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         + _unfitted_alone(answer)
         + _suspicion(answer)
         + _shifted(answer)
-        + _decided(answer)
+        + (in_words(answer.priors) if answer.steps else "")
         + _numerical(answer)
         + _beginning(answer)
         + _left_out(answer)
@@ -79,7 +79,7 @@ def _stopped(answer: Answer) -> str:
 
 def _unfitted_alone(answer: Answer) -> str:
     """Note if the base model could be fitted only with the missing effects."""
-    if answer.base.converged or not answer.causes.steps:
+    if answer.base.converged or not answer.steps:
         return ""
     return (
         " The fit of the base model alone has not converged: a better fit may leave smaller residuals, "
@@ -88,7 +88,7 @@ def _unfitted_alone(answer: Answer) -> str:
 
 
 def _suspicion(answer: Answer) -> str:
-    noise = answer.doubts.suspected
+    noise = answer.suspected
     if noise is None:
         return ""
     stated, other = (1e3 * noise_distance(n.first) for n in (answer.target.noise, noise))
@@ -100,22 +100,17 @@ def _suspicion(answer: Answer) -> str:
 
 
 def _shifted(answer: Answer) -> str:
-    if answer.doubts.shift is None:
+    if answer.shift is None:
         return ""
     return (
-        f" Repeats differ by constants of {1e3 * answer.doubts.shift:.2g} mm, which pass for noise here: a frame or a "
+        f" Repeats differ by constants of {1e3 * answer.shift:.2g} mm, which pass for noise here: a frame or a "
         "start that was not the same each time? Let camera_offset differ in [model.per_recording]."
     )
 
 
-def _decided(answer: Answer) -> str:
-    """Note on findings while a prior determines a parameter of the base model."""
-    return in_words(answer.doubts.priors) if answer.causes.steps else ""
-
-
 def _numerical(answer: Answer) -> str:
     """Note on a simulation that changes by more than the noise with half the time step."""
-    error, noise = answer.doubts.numerical, noise_distance(answer.target.noise.first)
+    error, noise = answer.numerical, noise_distance(answer.target.noise.first)
     if error is None or error <= noise:
         return ""
     return (
@@ -143,11 +138,13 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if not answer.converged:
         return _unconverged(answer, findings)
     if answer.verdict == NO_DISCREPANCY:
+        refined = answer.test_series[0].refined
+        finer = " on a mesh and time step twice as fine, which differ too little to be named" if refined else ""
         return (
             "No discrepancy: the base model's residuals are consistent with noise in these data (joint "
-            f"test p {_p(answer)}{_resolution(answer)}{_assumption(answer)}).{_invisible(answer)}"
+            f"test p {_p(answer)}{finer}{_assumption(answer)}).{_invisible(answer)}"
         )
-    if not findings and answer.causes.test_series[0].omnibus.p > answer.problem.rules.base_passes:
+    if not findings and answer.test_series[0].omnibus.p > answer.problem.rules.base_passes:
         distance = 1e3 * noise_distance(answer.target.noise.first)
         return (
             f"The base model's residuals, {distance:.2g} mm, change too slowly to be measurement noise, "
@@ -180,7 +177,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
         head = f"{named} explain{'s' if len(findings) == 1 else ''} {share}"
-    elif answer.causes.test_series[-1].omnibus.p > answer.problem.rules.extended_passes:
+    elif answer.test_series[-1].omnibus.p > answer.problem.rules.extended_passes:
         head = f"The best of the library, {named}, explains {share}; the rest may be noise, but that is not certain"
     else:
         head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
@@ -198,12 +195,12 @@ def _leading(answer: Answer) -> str:
     """The candidates that stand out so far: refitted candidates with their Bayes factors, or else the leading rows of
     the score tests.
     """
-    refits = sorted(answer.causes.refits.items(), key=lambda entry: -entry[1])[:MOST_EXCLUDED]
+    refits = sorted(answer.refits.items(), key=lambda entry: -entry[1])[:MOST_EXCLUDED]
     if refits:
         brings = ", ".join(f"{spoken(name)} {gained:.0f} nats" for name, gained in refits)
         return f"no refitted candidate has the required evidence ({brings})"
-    seen = [row for row in answer.causes.test_series[0].rows if row.adjusted_p <= answer.problem.rules.family]
-    if not answer.causes.test_series[0].rows:
+    seen = [row for row in answer.test_series[0].rows if row.adjusted_p <= answer.problem.rules.family]
+    if not answer.test_series[0].rows:
         return "no candidate was tested"
     if not seen:
         return "no candidate is significant"
@@ -218,7 +215,7 @@ def _unconverged(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     )
     remedy = "Start from a calibration with --from, narrow the priors, or shorten [simulator] time_step."
     if not findings:
-        leading = f" {_leading(answer).capitalize()}." if answer.causes.test_series[0].rows else ""
+        leading = f" {_leading(answer).capitalize()}." if answer.test_series[0].rows else ""
         return f"No verdict: the fit of the base model has not converged ({squares}).{leading} {remedy}"
     named = " and ".join(_named(finding) for finding in findings)
     gain = answer.validation.gain
@@ -233,7 +230,7 @@ def _errors(gain: Gain) -> str:
 def _small(answer: Answer) -> str:
     """Note on a significant discrepancy that is too small to matter."""
     size, noise = answer.remainder.amplitude * np.sqrt(3.0), noise_distance(answer.target.noise.first)
-    limit, numerical = answer.problem.rules.matters, answer.doubts.numerical
+    limit, numerical = answer.problem.rules.matters, answer.numerical
     beside = f"the noise is {1e3 * noise:.2g} mm"
     if numerical is not None:
         beside += f", and half the time step and a finer mesh move the markers by {1e3 * numerical:.2g} mm"
@@ -249,7 +246,7 @@ def _invisible(answer: Answer) -> str:
     """Candidates that remain possible because the measurements cannot show them."""
     names = [
         row.name.replace("_", " ")
-        for row in answer.causes.test_series[0].rows
+        for row in answer.test_series[0].rows
         if row.probe is None and not answer.problem.group_of(row.name)
     ]
     if not names:
@@ -260,7 +257,7 @@ def _invisible(answer: Answer) -> str:
 
 
 def _p(answer: Answer) -> str:
-    return p_in_words(answer.causes.test_series[0].omnibus.p, answer.problem.rules.bootstraps)
+    return p_in_words(answer.test_series[0].omnibus.p, answer.problem.rules.bootstraps)
 
 
 def _adoption(answer: Answer) -> str:
@@ -272,8 +269,8 @@ def _adoption(answer: Answer) -> str:
         return f" {worst} is clearly less likely with this ({errors}): extended.toml keeps the base model."
     if not answer.adopted:
         return " Unseen recordings do not clearly support this: extended.toml keeps the base model."
-    if answer.causes.unsupported:
-        names = " and ".join(map(spoken, answer.causes.unsupported))
+    if answer.unsupported:
+        names = " and ".join(map(spoken, answer.unsupported))
         return f" The fitted recordings also asked for {names}, which unseen recordings do not support: not adopted."
     return ""
 
@@ -299,13 +296,13 @@ def _size(row: dict[str, Any]) -> str:
 
 def _excluded(answer: Answer) -> str:
     """Candidates that were refitted in the first step and are much less likely."""
-    step = answer.causes.steps[0]
+    step = answer.steps[0]
     worse = [
         spoken(name)
         for name, value in step.refits.items()
         if name not in step.members
         and value < step.log_bayes_factor - TOLD_APART
-        and all(name != other.name for other in answer.causes.steps)
+        and all(name != other.name for other in answer.steps)
     ]
     return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""
 
@@ -318,7 +315,7 @@ def _only_noise(answer: Answer) -> bool:
 
 def _pattern(answer: Answer) -> str:
     """Clause about an extended model that fails the joint test."""
-    rules, last = answer.problem.rules, answer.causes.test_series[-1].omnibus.p
+    rules, last = answer.problem.rules, answer.test_series[-1].omnibus.p
     words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
     sure = last <= rules.base_passes and not _only_noise(answer)
     return f"{words}: something else is at work" if sure else words
@@ -332,12 +329,6 @@ def _remains(answer: Answer) -> str:
     if answer.target.noise.source != REPEATS:
         return remain
     return f"{remain}, {1e3 * noise_distance(answer.target.noise.first):.2g} mm of it noise"
-
-
-def _resolution(answer: Answer) -> str:
-    if answer.causes.test_series[0].refined:
-        return " on a mesh and time step twice as fine, which differ too little to be named"
-    return ""
 
 
 def _assumption(answer: Answer) -> str:

@@ -8,53 +8,11 @@ from rfdropo_bayes.runtime import configure_jax
 
 configure_jax()
 
-from rfdropo_bayes.fem.balance import energies  # noqa: E402
 from rfdropo_bayes.fem.cables import CableLayout, cable_layout  # noqa: E402
 from rfdropo_bayes.fem.chambers import chamber_layout  # noqa: E402
-from rfdropo_bayes.fem.dynamics import (  # noqa: E402
-    Material,
-    Prepared,
-    State,
-    System,
-    material,
-    prepare,
-    state_at_rest,
-    step,
-    without_cables,
-)
+from rfdropo_bayes.fem.dynamics import Material, System, material, prepare, state_at_rest, step, without_cables  # noqa: E402
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
-from rfdropo_bayes.fem.points import distribute_forces, point_positions  # noqa: E402
+from rfdropo_bayes.fem.points import point_positions  # noqa: E402
 from rfdropo_bayes.fem.rod import PointMap, Rod, attach, profile_rod, refined, solid_torsion_constant, uniform_rod  # noqa: E402
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402
-
-__all__ = [
-    "BendingLaw",
-    "BodyEffects",
-    "CableLayout",
-    "Material",
-    "PointMap",
-    "Prepared",
-    "Rod",
-    "State",
-    "System",
-    "Viscoelasticity",
-    "Wall",
-    "attach",
-    "cable_layout",
-    "chamber_layout",
-    "distribute_forces",
-    "energies",
-    "material",
-    "point_positions",
-    "prepare",
-    "profile_rod",
-    "refined",
-    "simulate",
-    "solid_torsion_constant",
-    "state_at_rest",
-    "static_equilibrium",
-    "step",
-    "uniform_rod",
-    "without_cables",
-]

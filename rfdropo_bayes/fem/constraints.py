@@ -217,7 +217,6 @@ def solve_constraints(
     previous: Float[Array, " cables"],
     time_step: Scalar,
     *,
-    give: Scalar = 0.0,
     slips: Slips | None = None,
     contacts: Contacts | None = None,
 ) -> Impulses:
@@ -231,10 +230,8 @@ def solve_constraints(
             its opening and sliding, without the gap.
         previous: impulses of the cables, the start of the iterations [N s].
         time_step: h [s].
-        give: compliance of every cable's length per tension, over the time step squared [1/kg].
     """
     cables = len(previous)
-    compliance = compliance.at[jnp.arange(cables), jnp.arange(cables)].add(give)
     problem = posed(compliance, cables, time_step, slips, contacts)
     slips, contacts = problem.slips, problem.contacts
     runs = len(slips.impulse)

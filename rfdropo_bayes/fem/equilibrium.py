@@ -6,6 +6,10 @@ large force along the axis (Magisano, Leonetti and Garcea 2017, "How to improve 
 method in geometrically non-linear structural problem discretized via displacement-based finite elements"). Increments
 that shrink slowly are prolonged by Aitken's rule. Mobilised friction of the cables continues from the
 previous state, so that it depends on the path. Derivatives are of the equations at the solution, with all terms.
+
+Moments turn with the sections only if the body has cables, which balance the moments of the sections. Another moment
+is of a load. A moment that is fixed in space has no symmetric tangent, and the tangent's symmetric part has no factor
+as soon as the moment bends the body by more than half a turn.
 """
 
 from __future__ import annotations
@@ -25,7 +29,17 @@ from rfdropo_bayes.fem.chambers import thrust
 from rfdropo_bayes.fem.components import turned
 from rfdropo_bayes.fem.constraints import Slips
 from rfdropo_bayes.fem.derivatives import pushed_forward
-from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, accept, displaced, stage_body, state_at_rest
+from rfdropo_bayes.fem.dynamics import (
+    LOST,
+    Prepared,
+    State,
+    StepInfo,
+    System,
+    accept,
+    displaced,
+    stage_body,
+    state_at_rest,
+)
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.integrators import Stage
 from rfdropo_bayes.fem.rod_elements import Six
@@ -157,10 +171,12 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
 
     A matrix without a solution, as near a loss of stability, is tried again with a share of the mass: a body then goes
     a step in time without damping. The share grows until there is a solution, and gets less far from rest. The
-    increments to come are no more than a geometric series that goes on as the last two did.
+    increments to come are no more than a geometric series that goes on as the last two did. A body without friction
+    that does not come to rest starts once more, undeformed.
     """
     way, cables = Way(system.clamped_stations, True, system.cables), len(system.cables.anchor)
     none, scales = jnp.zeros((6, len(task.start.position))), np.array([[system.body.length]] * 3 + [[1.0]] * 3)
+    turns = jnp.asarray([[1.0]] * 3 + [[float(cables > 0)]] * 3)
 
     def one(current: _Iterate) -> _Iterate:
         bonds = _bonds(system, task, current.place, current.impulse[:cables])
@@ -178,7 +194,7 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
         share = jnp.where(paced, jnp.minimum(limit, _pace(current, increment)), plain)
         remaining = jnp.where(grown | ~jnp.isfinite(current.largest), size, size**2 / (current.largest - size))
         remaining = jnp.where(share > 1.0, share * size, remaining)
-        turning = current.turning + share * (stresses(body, solution.change) - current.turning)
+        turning = current.turning + share * (turns * stresses(body, solution.change) - current.turning)
         shift = jnp.where(size > CALM, EASED, 1.0) * current.shift
         pace = jnp.where(shift < current.shift, 0.0, share)
         place = displaced(current.place, share * solution.change.T)
@@ -190,10 +206,25 @@ def _find(system: System, iterations: int, bound: float, task: Task) -> Equilibr
 
     runs = 0 if task.slip is None else len(task.slip.strength)
     impulse = jnp.concatenate([task.start.tension, jnp.zeros(runs)])
-    turning, least = stresses(_body(system, task, task.start), none), _least_shift(system, task.prepared)
+    turning, least = turns * stresses(_body(system, task, task.start), none), _least_shift(system, task.prepared)
     rest = task.moves > 0.5, task.moves, jnp.zeros(()), jnp.zeros(cables)
     first = _Iterate(task.start, impulse, turning, none[0, 0], jnp.array(jnp.inf), none, none[0, 0], *rest)
-    last = lax.while_loop(lambda c: c.moving & (c.iterations < iterations), one, first)
+    upright = state_at_rest(system)
+    undeformed = first._replace(
+        place=task.start._replace(position=upright.position, orientation=upright.orientation),
+        impulse=jnp.zeros_like(impulse),
+        turning=jax.tree.map(jnp.zeros_like, turning),
+    )
+
+    def attempt(number: Array, current: _Iterate) -> _Iterate:
+        away = current.place.position - upright.position
+        near = (jnp.max(jnp.abs(away)) < LOST * system.body.length) & jnp.all(jnp.isfinite(current.place.orientation))
+        again = (number > 0) & (task.moves > 0.5) & (current.moving | (current.solved < 0.5) | ~near)
+        new = undeformed._replace(iterations=current.iterations)
+        begun = jax.tree.map(lambda one, other: jnp.where(again, one, other), new, current)
+        return lax.while_loop(lambda c: c.moving & (c.iterations < begun.iterations + iterations), one, begun)
+
+    last = lax.fori_loop(0, 2 if task.slip is None else 1, attempt, first)
     return Equilibrium(
         last.place.position,
         last.place.orientation,

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from rfdropo_bayes.fem.cables import routed
 
@@ -54,17 +53,3 @@ def routes(cables: NodeCables, rest: Float[np.ndarray, "nodes 3"]) -> list[Float
     return [
         np.vstack([anchor, np.einsum("gk,gki->gi", weight, rest[node])[used]]) for anchor, node, weight, used in parts
     ]
-
-
-def cable_force(
-    cables: NodeCables, position: Float[Array, "nodes 3"], tension: Float[Array, " cables"]
-) -> Float[Array, "nodes 3"]:
-    """Forces of the cables on the nodes [N]."""
-    guided = jnp.einsum("cgk,cgki->cgi", cables.guide_weight, position[cables.guide_node])
-    points = jnp.concatenate([jnp.asarray(cables.anchor)[:, None, :], guided], axis=1)
-    used = cables.guide_used[..., None]
-    segment = jnp.where(used, points[:, 1:] - points[:, :-1], np.array([1.0, 0.0, 0.0]))
-    direction = jnp.where(used, segment / jnp.linalg.norm(segment, axis=-1, keepdims=True), 0.0)
-    pull = jnp.concatenate([direction[:, 1:], jnp.zeros_like(direction[:, :1])], axis=1) - direction
-    force = tension[:, None, None, None] * cables.guide_weight[..., None] * pull[:, :, None, :]
-    return jnp.zeros_like(position).at[cables.guide_node].add(force)

@@ -1,4 +1,4 @@
-"""Corotational linear tetrahedra: frames, forces of any tetrahedral mesh.
+"""Corotational linear tetrahedra: a mesh, its frames and masses; `native.tetrahedral` computes the motion.
 
 Each element is linear elastic in a frame that turns with it: f_a = -V Q S(H) g_a with g_a the gradients of the shape
 functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law. Two frames:
@@ -22,7 +22,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sparse
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from scipy.sparse.csgraph import connected_components
 
@@ -134,93 +133,6 @@ def _edge_axes(corners: Float[Array, "elements 4 3"]) -> Float[Array, "elements 
     normal = jnp.cross(first, across)
     normal = normal / jnp.linalg.norm(normal, axis=1, keepdims=True)
     return jnp.stack([first, jnp.cross(normal, first), normal], axis=1)
-
-
-def cofactor(matrix: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-    """Cofactors of 3 x 3 matrices, det(F) F^-T: no LAPACK call for a matrix this small."""
-    first, second, third = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
-    return jnp.stack([jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)], axis=-2)
-
-
-def polar_rotation(deformation: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-    """Rotation R of the polar decomposition F = R U, for det F > 0, by Newton's iteration (Higham 1986, SIAM J. Sci.
-    Stat. Comput. 7:1160-1174)."""
-
-    def average(_: Int[Array, ""], current: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
-        adjugate = cofactor(current)
-        determinant = jnp.sum(current[..., :1, :] * adjugate[..., :1, :], axis=-1, keepdims=True)
-        return 0.5 * (current + adjugate / determinant)
-
-    return lax.fori_loop(0, POLAR_ITERATIONS, average, deformation)
-
-
-def lame_constants(
-    young_modulus: Float[Array, ""], poisson_ratio: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """First Lame constant and shear modulus [Pa]; Poisson's ratio is limited to `POISSON_LIMIT`."""
-    poisson_ratio = jnp.minimum(poisson_ratio, POISSON_LIMIT)
-    shear = young_modulus / (2.0 * (1.0 + poisson_ratio))
-    return 2.0 * shear * poisson_ratio / (1.0 - 2.0 * poisson_ratio), shear
-
-
-def element_rotations(body: TetrahedralBody, position: Float[Array, "nodes 3"]) -> Float[Array, "elements 3 3"]:
-    """Rotation of every element from rest."""
-    corners = position[body.element]
-    if body.frames == "edges":
-        return jnp.einsum("eki,ekj->eij", _edge_axes(corners), body.rest_frame)
-    return polar_rotation(jnp.einsum("eai,eaj->eij", corners, body.gradient))
-
-
-def _slope(
-    body: TetrahedralBody,
-    turn: Float[Array, "elements 3 3"],
-    field: Float[Array, "nodes 3"],
-    rest: Float[Array, "nodes 3"] | float,
-) -> Float[Array, "elements 3 3"]:
-    """Gradient of Q' field - rest in every element."""
-    corners = field[body.element]
-    local = jnp.einsum("eji,eaj->eai", turn, corners - corners[:, :1])
-    if not isinstance(rest, float):
-        corners = rest[body.element]
-        local = local - (corners - corners[:, :1])
-    return jnp.einsum("eai,eaj->eij", local, body.gradient)
-
-
-def _stress(
-    slope: Float[Array, "elements 3 3"], lame: tuple[Float[Array, "..."], Float[Array, "..."]]
-) -> Float[Array, "elements 3 3"]:
-    """Hooke's law, with Lame constants of the body or of each element."""
-    first, shear = (jnp.broadcast_to(value, slope.shape[:1])[:, None, None] for value in lame)
-    trace = jnp.trace(slope, axis1=1, axis2=2)[:, None, None]
-    return first * trace * jnp.eye(3) + shear * (slope + jnp.swapaxes(slope, 1, 2))
-
-
-def elastic_energy(
-    body: TetrahedralBody,
-    turn: Float[Array, "elements 3 3"],
-    position: Float[Array, "nodes 3"],
-    lame: tuple[Float[Array, "..."], Float[Array, "..."]],
-) -> Float[Array, ""]:
-    """Energy of the elements' strain [J]."""
-    slope = _slope(body, turn, position, jnp.asarray(body.rest))
-    return 0.5 * jnp.einsum("e,eij,eij->", body.volume, _stress(slope, lame), slope)
-
-
-def nodal_force(
-    body: TetrahedralBody,
-    turn: Float[Array, "elements 3 3"],
-    field: Float[Array, "nodes 3"],
-    rest: Float[Array, "nodes 3"] | float,
-    lame: tuple[Float[Array, "..."], Float[Array, "..."]],
-) -> Float[Array, "nodes 3"]:
-    """Forces -Q K (Q' field - rest) on the nodes [N]: elastic forces from positions; -K v from velocities with ``rest``
-    zero.
-
-    ``lame`` are the Lame constants [Pa], of the body or of each element.
-    """
-    stress = _stress(_slope(body, turn, field, rest), lame)
-    force = -jnp.einsum("e,eij,ejk,eak->eai", body.volume, turn, stress, body.gradient)
-    return jnp.zeros_like(body.rest).at[body.element].add(force)
 
 
 def lumped_masses(body: TetrahedralBody, density: Float[Array, ""] | float) -> Float[Array, " nodes"]:

@@ -77,7 +77,7 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
     for name, values in draws.items():
         values, (low, high), prior = np.ravel(values), ends[name], np.asarray(drawn[name], dtype=float)
         side = cut_off_at(values, low, high)
-        if side and _even_in_logarithms(prior):
+        if side and np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)):
             side = cut_off_at(values, low, high, logarithmic=True)
         if side:
             word, end = ("lower", low) if side == "low" else ("upper", high)
@@ -88,10 +88,6 @@ def prior_cautions(problem: Problem, draws: Draws) -> list[Caution]:
         elif contradicts(values, prior):
             apart.append(name)
     return cautions + [Caution(Code.AGAINST_PRIOR, contradiction(apart))] * bool(apart)
-
-
-def _even_in_logarithms(prior: Float[np.ndarray, " n"]) -> bool:
-    return bool(np.all(prior > 0.0) and abs(skew(np.log(prior))) < abs(skew(prior)))
 
 
 def stage_cautions(trace: list[dict[str, Any]], rollouts: float | None) -> list[Caution]:
@@ -166,10 +162,10 @@ def unseen_modes(replicates: int, optimisations: int | None = None) -> list[Caut
     return [Caution(Code.MODES_UNSEEN, sentence)]
 
 
-def exclusion_cautions(excluded: Mapping[str, int], evaluations: int, *, share: float = 0.05) -> list[Caution]:
-    """A caution if more than ``share`` of the rollouts were excluded."""
+def exclusion_cautions(excluded: Mapping[str, int], evaluations: int) -> list[Caution]:
+    """A caution if more than 5 % of the rollouts were excluded."""
     total = sum(excluded.values())
-    if evaluations == 0 or total / evaluations <= share:
+    if evaluations == 0 or total / evaluations <= 0.05:
         return []
     reasons = ", ".join(f"{name} {count}" for name, count in sorted(excluded.items()))
     sentence = f"{total} of {evaluations} rollouts got no weight ({reasons})"

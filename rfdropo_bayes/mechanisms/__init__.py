@@ -5,5 +5,3 @@ from rfdropo_bayes.runtime import configure_jax
 configure_jax()
 
 from rfdropo_bayes.mechanisms.registry import REGISTRY, mechanisms_named  # noqa: E402
-
-__all__ = ["REGISTRY", "mechanisms_named"]

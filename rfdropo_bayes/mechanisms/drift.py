@@ -34,7 +34,18 @@ class Drift:
 
     def __init__(self, own: Any = None) -> None:
         self.own: Any = self.kind() if own is None else own
-        self.parameters = tuple(_rate(spec) for spec in self.own.parameters)
+        self.parameters = tuple(
+            spec._replace(
+                name=spec.name + RATE,
+                unit="1/s" if spec.unit == "-" else f"{spec.unit}/s",
+                low=spec.low - spec.nominal,
+                high=spec.high - spec.nominal,
+                nominal=0.0,
+                prior={**spec.prior, "scale": spec.prior["scale"] / USUAL},
+                description=f"rate of the {spec.description}",
+            )
+            for spec in self.own.parameters
+        )
 
     @classmethod
     def for_robot(cls, robot: Robot) -> Any:
@@ -50,19 +61,6 @@ class Drift:
             size = spec.nominal + values[spec.name + RATE] * elapsed
             sizes[spec.name] = jnp.where(size < spec.low, spec.low, jnp.where(size > spec.high, spec.high, size))
         return sizes
-
-
-def _rate(spec: ParameterSpec) -> ParameterSpec:
-    """The rate of a size."""
-    return spec._replace(
-        name=spec.name + RATE,
-        unit="1/s" if spec.unit == "-" else f"{spec.unit}/s",
-        low=spec.low - spec.nominal,
-        high=spec.high - spec.nominal,
-        nominal=0.0,
-        prior={**spec.prior, "scale": spec.prior["scale"] / USUAL},
-        description=f"rate of the {spec.description}",
-    )
 
 
 class ActuationDrift(Drift, SteppedActuation):

@@ -23,14 +23,13 @@ def mechanism_rows() -> list[Row]:
     ]
 
 
-def mechanism_facts(name: str, robot: str = EXAMPLE_ROBOT) -> tuple[Row, list[Row]]:
-    """Facts about a mechanism, and a row for each of its parameters.
+def mechanism_facts(name: str) -> tuple[Row, list[Row]]:
+    """Facts about a mechanism, and a row for each of its parameters on the example robot.
 
     Raises:
-        InputError: no such mechanism, or no such robot.
+        InputError: no such mechanism.
     """
-    made_for = Robot.load(robot)
-    (mechanism,) = mechanisms_named([name], made_for, where="mechanisms")
+    (mechanism,) = mechanisms_named([name], Robot.load(EXAMPLE_ROBOT), where="mechanisms")
     facts = {
         "mechanism": mechanism.name,
         "what": first_paragraph(type(mechanism).__doc__),

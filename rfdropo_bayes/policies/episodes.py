@@ -18,6 +18,7 @@ from rfdropo_bayes.policies.randomisation import Randomisation, fitting
 from rfdropo_bayes.policies.tasks import (
     EPISODE,
     FLOOR,
+    MOVING,
     Actions,
     Observed,
     Task,
@@ -190,7 +191,9 @@ class Episodes:
                 remedy="look for NaN in the policy",
             )
         change = self.layout.change(actions.reshape(self.lanes, *actions.shape[1:]))
-        self.commands = np.clip(self.commands + change, self.layout.low, self.layout.high)
+        before = self.commands
+        self.commands = np.clip(before + change, self.layout.low, self.layout.high)
+        moved = np.mean(((self.commands - before) / np.max(self.layout.moves, axis=0)) ** 2, axis=1)
         observation = self.session.act(self.commands)
         good = (np.asarray(observation.status) == int(Result.OK)) & np.isfinite(observation.position).all(axis=(1, 2))
         self.marker = np.where(good[:, None, None], observation.position, self.marker)
@@ -200,7 +203,7 @@ class Episodes:
         self.seen_before = self.seen
         self._look(np.arange(self.lanes))
         distance = self.distance()
-        gained = np.where(good, reward(distance, self.first), FLOOR * (EPISODE - self.age + 1))
+        gained = np.where(good, reward(distance, self.first) - MOVING * moved, FLOOR * (EPISODE - self.age + 1))
         ended = ~good if self.settings.near is None else ~good | (distance <= self.settings.near)
         tension, limit = self._largest_tension(observation, good), self.settings.tension_limit
         stopped = np.zeros(self.lanes, dtype=bool) if limit is None else good & (tension > limit)

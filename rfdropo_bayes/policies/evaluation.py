@@ -18,6 +18,7 @@ from scipy.stats import binomtest, bootstrap, trim_mean
 
 from rfdropo_bayes.errors import InputError
 
+LONGEST = 10_000  # most actions of an episode
 THRESHOLDS = (0.005, 0.01, 0.01525, 0.02157, 0.030)
 """Distances [m] within which an episode succeeds; the last three are the paper's."""
 EVALUATION_SEED = 2_000_003  # None of the seeds that training or its evaluations use
@@ -68,7 +69,7 @@ def _first_seed(seed: int, *stream: int) -> int:
     return int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0])
 
 
-def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0, longest: int = 10_000) -> list[Episode]:
+def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0) -> list[Episode]:
     """Play every case once. The noise depends neither on the policy nor on the number of lanes.
 
     Args:
@@ -77,7 +78,6 @@ def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0, longest: int
             ``diverged`` in their info, and perhaps ``tension`` and ``stopped``.
         cases: starts of the episodes.
         seed: seed of the noise.
-        longest: most actions of an episode.
 
     Returns:
         an episode for every case, in order.
@@ -88,18 +88,18 @@ def play(act: Act, venv: Any, cases: Sequence[Case], seed: int = 0, longest: int
         lanes = chunk + [chunk[-1]] * (venv.num_envs - len(chunk))
         venv.seed(_first_seed(seed, 1) + first)
         venv.set_options([{"parameters": dict(case.parameters), "goal": list(case.goal)} for case in lanes])
-        episodes += _play_lanes(act, venv, len(chunk), first, longest)
+        episodes += _play_lanes(act, venv, len(chunk), first)
     return episodes
 
 
-def _play_lanes(act: Act, venv: Any, count: int, first: int, longest: int) -> list[Episode]:
+def _play_lanes(act: Act, venv: Any, count: int, first: int) -> list[Episode]:
     """One episode in each of the first ``count`` lanes."""
     distances: list[list[float]] = [[] for _ in range(count)]
     actions: list[list[np.ndarray]] = [[] for _ in range(count)]
     total, tension = np.zeros(count), np.full(count, np.nan)
     diverged, stopped, done = np.zeros((3, count), dtype=bool)
     seen = venv.reset()
-    for _ in range(longest):
+    for _ in range(LONGEST):
         action = act(seen)
         seen, reward, ended, infos = venv.step(action)
         for lane in np.flatnonzero(~done):
@@ -123,13 +123,13 @@ def _play_lanes(act: Act, venv: Any, count: int, first: int, longest: int) -> li
                 )
                 for k in range(count)
             ]
-    raise InputError(f"an episode did not end within {longest} actions", where="evaluation", remedy="give it a limit")
+    raise InputError(f"an episode did not end within {LONGEST} actions", where="evaluation", remedy="give it a limit")
 
 
-def success(episodes: Sequence[Episode], threshold: float, level: float = 0.95) -> tuple[float, float, float]:
-    """Share of the episodes that end within ``threshold`` [m], with the ends of its Wilson interval."""
+def success(episodes: Sequence[Episode], threshold: float) -> tuple[float, float, float]:
+    """Share of the episodes that end within ``threshold`` [m], with the ends of its 95 % Wilson interval."""
     hits = int(np.sum([episode.distance <= threshold for episode in episodes]))
-    interval = binomtest(hits, len(episodes)).proportion_ci(level, method="wilson")
+    interval = binomtest(hits, len(episodes)).proportion_ci(0.95, method="wilson")
     return hits / len(episodes), float(interval.low), float(interval.high)
 
 
@@ -155,17 +155,13 @@ def without_end(stopped: float, failed: float) -> str:
     return f"{stopped:.0f} stopped by the limit on tension, {failed:.0f} failed"
 
 
-def interquartile_mean(
-    groups: Sequence[Sequence[Episode]], seed: int, level: float = 0.95, resamples: int = 2000
-) -> tuple[float, float, float]:
-    """Mean of the middle half of all final distances [m], with a bootstrap interval stratified by group.
+def interquartile_mean(groups: Sequence[Sequence[Episode]], seed: int) -> tuple[float, float, float]:
+    """Mean of the middle half of all final distances [m], with a 95 % bootstrap interval stratified by group.
 
     Args:
         groups: episodes of each training seed (Agarwal et al. 2021, "Deep RL at the edge of the statistical
             precipice").
         seed: seed of the bootstrap.
-        level: level of the interval.
-        resamples: number of bootstrap samples.
 
     Returns:
         the mean and the ends of its interval; the ends are NaN if a group has a single episode.
@@ -185,8 +181,8 @@ def interquartile_mean(
         interval = bootstrap(
             distances,
             middle,
-            n_resamples=resamples,
-            confidence_level=level,
+            n_resamples=2000,
+            confidence_level=0.95,
             method="percentile",
             vectorized=True,
             rng=np.random.default_rng(seed),

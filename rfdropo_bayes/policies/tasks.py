@@ -108,6 +108,12 @@ def reward(
     return (beginning - potential(distance)) / beginning - 0.05
 
 
+MOVING = 0.5
+"""Part of an action's reward that a policy loses if it moves every cable by the largest step.
+
+A command is carried out over the robot's ramp. Ramps longer than the control period overlap: commands that alternate
+then cancel each other, and the authors' reward does not see them. The tip leaves the goal once the policy stops.
+"""
 NEAREST = 0.005  # least initial distance that scales the rewards [m]: the potential goes through zero at a millimetre
 FLOOR = -1.05
 """Reward for each action that is missing after a failed simulation: the reward at about twice the initial distance.

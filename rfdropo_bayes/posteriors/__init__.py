@@ -1,37 +1,7 @@
 """Draws and predictions on disk: the only room that depends on ArviZ."""
 
 from rfdropo_bayes.posteriors.bounds import contradiction, contradicts, cut_off_at
-from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
-from rfdropo_bayes.posteriors.inference_data import (
-    InferenceData,
-    central_interval,
-    load_posterior,
-    save_posterior,
-    summarise,
-    to_tree,
-)
+from rfdropo_bayes.posteriors.derived import ProductOfPowers
+from rfdropo_bayes.posteriors.inference_data import InferenceData, central_interval, load_posterior, summarise
 from rfdropo_bayes.posteriors.parameter_info import SHARED, DrawsByOwner, ParameterInfo, Scope, by_owner, label
 from rfdropo_bayes.posteriors.record import FIXED, PosteriorRecord, RecordingPrediction
-
-__all__ = [
-    "FIXED",
-    "SHARED",
-    "DrawsByOwner",
-    "InferenceData",
-    "ParameterInfo",
-    "PosteriorRecord",
-    "ProductOfPowers",
-    "RecordingPrediction",
-    "Scope",
-    "by_owner",
-    "central_interval",
-    "contradiction",
-    "contradicts",
-    "cut_off_at",
-    "evaluate_products",
-    "label",
-    "load_posterior",
-    "save_posterior",
-    "summarise",
-    "to_tree",
-]

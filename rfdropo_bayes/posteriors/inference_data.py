@@ -184,11 +184,11 @@ def summarise(posterior: Draws) -> dict[str, dict[str, float]]:
     }
 
 
-def central_interval(draws: Float[np.ndarray, " n"], mass: float = 0.9) -> tuple[float, float]:
-    """Quantiles of the posterior that leave the same mass on either side.
+def central_interval(draws: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Quantiles of the posterior that leave 5 % on either side.
 
     The k-th smallest of n draws has k / (n + 1) of the posterior below it, on average (Weibull's plotting position).
     The usual sample quantiles are too narrow: with 100 draws a nominal 90 % interval holds 88 %.
     """
-    low, high = np.quantile(draws, [0.5 - 0.5 * mass, 0.5 + 0.5 * mass], method="weibull")
+    low, high = np.quantile(draws, [0.5 - 0.45, 0.5 + 0.45], method="weibull")
     return float(low), float(high)

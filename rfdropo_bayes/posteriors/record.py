@@ -131,13 +131,17 @@ class PosteriorRecord:
     def tree(self) -> xr.DataTree:
         """The record as a tree of datasets, one for each of ArviZ's groups."""
         products = [{**asdict(p), "powers": dict(p.powers)} for p in self.derived]
+        masks = {  # ArviZ expects a prediction of all observed data
+            f"mask_{i}": ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8))
+            for i, r in enumerate(self.recordings)
+        }
         return to_tree(
             self.posterior,
             prior=self.prior,
             posterior_predictive=_predictions(self.recordings),
             prior_predictive=_prior_predictions(self.recordings),
             observed_data=_observations(self.recordings),
-            constant_data=_masks(self.recordings),
+            constant_data=xr.Dataset(masks) if masks else None,
             sample_stats=_stages(self.trace, self.block_scores),
             log_likelihood=self.log_likelihood,
             parameters=self.parameters,
@@ -236,14 +240,6 @@ def _observations(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | Non
         data[f"position_{i}"] = ((f"time_{i}", f"marker_{i}", "axis"), np.asarray(r.observed, dtype=float), attrs)
         coords |= {f"time_{i}": np.asarray(r.time, dtype=float), f"marker_{i}": list(r.marker_names)}
     return xr.Dataset(data, coords=coords, attrs={"recordings": len(recordings)}) if recordings else None
-
-
-def _masks(recordings: Sequence[RecordingPrediction]) -> xr.Dataset | None:
-    """Masks of the observations; ArviZ expects a prediction of all observed data."""
-    data = {
-        f"mask_{i}": ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8)) for i, r in enumerate(recordings)
-    }
-    return xr.Dataset(data) if data else None
 
 
 def _recordings(data: Mapping[str, xr.Dataset]) -> tuple[RecordingPrediction, ...]:

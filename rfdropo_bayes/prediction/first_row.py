@@ -21,7 +21,7 @@ from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import next_step
+from rfdropo_bayes.inference.smc.tempering import next_step
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.model_error import ModelError
 from rfdropo_bayes.prediction.own_fit import fit_own

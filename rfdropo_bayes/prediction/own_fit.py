@@ -77,7 +77,10 @@ def fit_own(
                 curvature[chosen],
                 going,
             )
-            slope[going] = _corrected(slope[going], moved - point[going], moved_value - value[going])
+            way = moved - point[going]  # Broyden's update; derivatives of a draw that has not moved are unchanged
+            missing = moved_value - value[going] - np.einsum("nij,nj->ni", slope[going], way)
+            length = np.sum(way**2, axis=1)
+            slope[going] += missing[:, :, None] * (way / np.where(length > 0.0, length, 1.0)[:, None])[:, None]
             point[going], value[going] = moved, moved_value
             delivered[going] = before - _cost(moved_value, moved, centre[going])
         still = delivered[todo] < TOLERANCE
@@ -97,15 +100,6 @@ def fit_own(
         step += 1
         report(step, float(np.mean(converged)))
     return OwnFit(point, value, slope, converged, step)
-
-
-def _corrected(
-    slope: Float[np.ndarray, "n m k"], moved: Float[np.ndarray, "n k"], changed: Float[np.ndarray, "n m"]
-) -> Float[np.ndarray, "n m k"]:
-    """Derivatives after Broyden's update; unchanged for a draw that has not moved."""
-    length = np.sum(moved**2, axis=1)
-    missing = changed - np.einsum("nij,nj->ni", slope, moved)
-    return slope + missing[:, :, None] * (moved / np.where(length > 0.0, length, 1.0)[:, None])[:, None]
 
 
 def _step(

@@ -328,34 +328,18 @@ def with_measured_starts(
     inferred = {p.spec.name for p in model.scopes.parameters}
     parameters = [p for p in model.scopes.parameters if p.spec.name not in PLACE]
     placed = {p.name: values[p.name] for p in parameters}
+    count = len(next(iter(values.values())))
     for run in trajectories:
-        measured = _place(simulator, model, run, values)
-        known = {**model.scopes.values_in(run.name, values), **measured}
+        known, measured = model.scopes.values_in(run.name, values), dict[str, np.ndarray]()
+        if run.object_pose is not None and np.isfinite(run.object_pose[0]).all():
+            start = simulator.with_object_at(known, run.object_pose[0])
+            measured = {name: np.broadcast_to(np.asarray(start[name]), (count,)) for name in PLACE}
+        known = {**known, **measured}
         for name in (name for name in PLACE if name in measured or (name in inferred and name in known)):
             own = InferredParameter.of(specs[name], {}, Scope(run.name), (run.name,), where="prediction")
             parameters.append(own)
             placed[own.name] = np.asarray(known[name])
     return replace(model, scopes=replace(model.scopes, parameters=tuple(parameters))), placed
-
-
-def _place(simulator: RobotSimulator, model: TrajectoryModel, trajectory: Trajectory, values: Batch) -> Batch:
-    """Centre [m] and yaw [rad] of the measured cube in the robot's frame, for every draw; empty if there is none."""
-    pose = trajectory.object_pose
-    if pose is None or not np.isfinite(pose[0]).all():
-        return {}
-    count = len(next(iter(values.values())))
-    known = model.scopes.values_in(trajectory.name, values)
-    placed = simulator.with_object_at(known, pose[0])
-    return {name: np.broadcast_to(np.asarray(placed[name]), (count,)) for name in PLACE}
-
-
-def offsets(known: Mapping[str, object], count: int) -> Float[np.ndarray, "n 3"]:
-    """Shift [m] of measured against simulated positions among the values of one recording; zero if no offset is a
-    parameter.
-    """
-    return np.stack(
-        [np.broadcast_to(np.asarray(known.get(name, 0.0), dtype=float), (count,)) for name in OFFSETS], axis=1
-    )
 
 
 def measured_objects(
@@ -369,7 +353,10 @@ def measured_objects(
     count = len(shifted)
     for index, name in enumerate(model.recordings.names):
         known = model.scopes.values_in(name, values)
-        shifted[:, index, :, :3] += offsets(known, count)[:, None]
+        for axis, offset in enumerate(OFFSETS):  # zero if no offset is a parameter
+            shifted[:, index, :, axis] += np.broadcast_to(np.asarray(known.get(offset, 0.0), dtype=float), (count,))[
+                :, None
+            ]
         sizes = {s.name: np.broadcast_to(known[s.name], (count,)) for s in SIZES if s.name in known}
         if sizes:
             keys = jax.random.split(jax.random.fold_in(key, index), count)

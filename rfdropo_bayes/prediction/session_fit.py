@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
-from rfdropo_bayes.inference import next_step
+from rfdropo_bayes.inference.smc.tempering import next_step
 from rfdropo_bayes.prediction.first_row import LEAST_SHARE, SURE
 from rfdropo_bayes.prediction.own_fit import OwnFit, fit_own
 

@@ -4,23 +4,5 @@ from rfdropo_bayes.report.baselines import BaselineErrors, baseline_errors
 from rfdropo_bayes.report.facts import RecordingFacts, RunFacts, software_versions
 from rfdropo_bayes.report.page import render_page
 from rfdropo_bayes.report.run_files import rebuild_report, write_run
-from rfdropo_bayes.report.scores import ErrorFigures, MeasuredPath, measured_paths, score
-from rfdropo_bayes.report.summary import build_summary, read_summary, write_summary
-
-__all__ = [
-    "BaselineErrors",
-    "ErrorFigures",
-    "MeasuredPath",
-    "RecordingFacts",
-    "RunFacts",
-    "baseline_errors",
-    "build_summary",
-    "measured_paths",
-    "read_summary",
-    "rebuild_report",
-    "render_page",
-    "score",
-    "software_versions",
-    "write_run",
-    "write_summary",
-]
+from rfdropo_bayes.report.scores import MeasuredPath, score
+from rfdropo_bayes.report.summary import build_summary, read_summary

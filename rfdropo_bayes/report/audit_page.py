@@ -47,7 +47,10 @@ def render_audit(
         title=title,
         sections=SECTIONS,
         pictures=_pictures(seen, outline),
-        classes=[(c, embed(figures.class_figure(seen.residuals, c), _caption(c))) for c in seen.classes],
+        classes=[
+            (c, embed(figures.class_figure(seen.residuals, c), f"Misfit with and without {display_name(c.names[0])}"))
+            for c in seen.classes
+        ],
         replayed=replay(seen.tracks, outline),
         config=config,
     )
@@ -90,7 +93,7 @@ def residuals_of(answer: Answer) -> figures.Residuals:
 def shown(answer: Answer) -> figures.Shown:
     """Data of the figures of an audit."""
     step = float(np.median(np.diff(answer.target.measurements.time[0])))
-    probed = [row for row in answer.causes.test_series[0].rows if row.probe is not None][:MOST_COSINES]
+    probed = [row for row in answer.test_series[0].rows if row.probe is not None][:MOST_COSINES]
     marks = [row.probe.mark for row in probed if row.probe is not None]
     unseen, validation, tracks = None, answer.validation, list[Track]()
     if validation.predictions is not None and validation.unseen is not None and validation.gain is not None:
@@ -110,9 +113,9 @@ def shown(answer: Answer) -> figures.Shown:
     rest = answer.remainder
     return figures.Shown(
         residuals_of(answer),
-        [tests.omnibus.blocks.tolist() for tests in answer.causes.test_series],
+        [tests.omnibus.blocks.tolist() for tests in answer.test_series],
         BLOCK * step,
-        ["base model", *(f"with {display_name(step.name)}" for step in answer.causes.steps)],
+        ["base model", *(f"with {display_name(step.name)}" for step in answer.steps)],
         [row.name for row in probed],
         np.array([[likeness(a, b) for b in marks] for a in marks]),
         unseen,
@@ -125,7 +128,7 @@ def shown(answer: Answer) -> figures.Shown:
 
 def class_effects(answer: Answer) -> list[figures.ClassEffect]:
     """Effects of the leading classes of candidates on the base model's residuals, adopted or not."""
-    first, rules = answer.causes.test_series[0], answer.problem.rules
+    first, rules = answer.test_series[0], answer.problem.rules
     heads: list[list[ScoreRow]] = []
     for row in first.rows:
         if row.probe is None or row.adjusted_p > rules.family:
@@ -168,7 +171,7 @@ def _effect(answer: Answer, tests: ScoreTests, members: Sequence[ScoreRow]) -> f
 
 def _signal(answer: Answer) -> figures.Signal | None:
     """The signal at the port of the law, of its members the one of most evidence; without a law at the port of most."""
-    described = answer.causes.described
+    described = answer.described
     if described is None or not described.search.significant(answer.problem.rules.family):
         return None
     row, terms = described.search.ports[0], described.search.terms
@@ -177,10 +180,6 @@ def _signal(answer: Answer) -> figures.Signal | None:
         row = next(each for each in described.search.ports if each.port in members)
     names = answer.target.measurements.names
     return figures.Signal(row.port.words, row.port.unit, names, described.search.centre, row.mean, row.sd)
-
-
-def _caption(effect: figures.ClassEffect) -> str:
-    return f"Misfit with and without {display_name(effect.names[0])}"
 
 
 def _pictures(seen: figures.Shown, outline: Mapping[str, Any] | None) -> dict[str, Picture | None]:

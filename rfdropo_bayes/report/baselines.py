@@ -120,7 +120,7 @@ def _tolerance(recording: Trajectory) -> float:
 
 
 def baseline_errors(
-    fit: Sequence[Trajectory], test: Sequence[Trajectory], *, markers: Sequence[str] | None = None, trained_on: str = ""
+    fit: Sequence[Trajectory], test: Sequence[Trajectory], *, markers: Sequence[str] | None = None
 ) -> dict[str, BaselineErrors]:
     """Train every predictor on the fit recordings and score it on both roles, by the markers that all of them have.
 
@@ -128,7 +128,6 @@ def baseline_errors(
         fit: recordings a fit may see.
         test: recordings no fit sees; may be empty.
         markers: markers to score, in the robot's order; by default the first recording's.
-        trained_on: words for the fit recordings; by default their number and length.
 
     Returns:
         By name; empty if no marker is in all recordings.
@@ -138,7 +137,7 @@ def baseline_errors(
         return {}
     fit, test = ([_with_markers(t, shared) for t in recordings] for recordings in (fit, test))
     seconds = sum(float(t.time[-1]) for t in fit)
-    trained_on = trained_on or f"{seconds:.4g} s in {len(fit)} recording{'s' if len(fit) != 1 else ''}"
+    trained_on = f"{seconds:.4g} s in {len(fit)} recording{'s' if len(fit) != 1 else ''}"
     groups = [list(group) for group in group_repeats(fit)]
     linear, cubic = fit_fir(fit, groups, degree=1), fit_fir(fit, groups, degree=3)
     predictors: dict[str, tuple[str, str, Predictor]] = {

@@ -49,14 +49,9 @@ class Combination:
         return self.sd / self.prior_sd if self.prior_sd else None
 
 
-def identify(record: PosteriorRecord, *, names: list[str] | None = None) -> list[Combination]:
-    """Combinations of the free parameters, best determined first.
-
-    Args:
-        record: posterior, and prior draws to compare with.
-        names: examined parameters; by default the parameters shared by all recordings.
-    """
-    chosen = [info for info in record.free if (not info.scope.owner if names is None else info.name in names)]
+def identify(record: PosteriorRecord) -> list[Combination]:
+    """Combinations of the parameters shared by all recordings, best determined first."""
+    chosen = [info for info in record.free if not info.scope.owner]
     varying = [info for info in chosen if np.ptp(record.flat(info.name)) > 0]
     scaled = [info.name for info in varying if _has_scale(record, info)]
     logs = {n: np.log(record.flat(n)) for n in scaled}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +91,9 @@ def _draw(motion: DrawnMotion, row: int, space: Any, flat: dict[str, Axes], colo
 
 
 @styled
-def still(motion: DrawnMotion, instants: Sequence[int] | None = None) -> Figure:
+def still(motion: DrawnMotion) -> Figure:
     """Several instants in one picture, from light to dark; dots are measured markers."""
-    rows = np.unique(np.linspace(0, len(motion.time) - 1, INSTANTS).astype(int)) if instants is None else instants
+    rows = np.unique(np.linspace(0, len(motion.time) - 1, INSTANTS).astype(int))
     figure, space, flat = _frame(motion)
     shades = colormaps["Blues"](np.linspace(0.35, 0.95, len(rows)))
     for row, shade, alpha in zip(rows, shades, np.linspace(0.35, 0.95, len(rows)), strict=True):

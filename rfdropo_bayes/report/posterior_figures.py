@@ -18,6 +18,7 @@ from rfdropo_bayes.report.units import display_unit
 MOST_PAIRED = 6
 MOST_PANELS = 24
 SHOWN_DRAWS = 1200
+MARGIN = 0.08  # beside the values, in widths of their range
 RIDGE = 0.9
 
 
@@ -43,13 +44,13 @@ def _transformed(record: PosteriorRecord, name: str) -> Float[np.ndarray, " n"]:
 class _Scale:
     """Axis of the values of one parameter: unit, logarithm, range."""
 
-    def __init__(self, info: ParameterInfo, values: Float[np.ndarray, " n"], *, margin: float = 0.08) -> None:
+    def __init__(self, info: ParameterInfo, values: Float[np.ndarray, " n"]) -> None:
         self.factor, unit = display_unit(info.unit, float(np.median(np.abs(values))))
         self.label = style.label_with_unit(info.name, unit)
         self.log = info.logarithmic and bool(np.all(values > 0))
         low, high = self.forward(np.quantile(values, [0.002, 0.998]))
         width = (high - low) or abs(high) or 1.0
-        limits = self.backward(np.array([low - margin * width, high + margin * width]))
+        limits = self.backward(np.array([low - MARGIN * width, high + MARGIN * width]))
         self.limits = np.clip(limits, info.low / self.factor, info.high / self.factor)
 
     def forward(self, values: np.ndarray) -> np.ndarray:

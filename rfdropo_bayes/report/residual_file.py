@@ -16,8 +16,8 @@ def residual_dataset(answer: Answer) -> xr.Dataset:
     """
     measured, markers = answer.target.measurements, answer.problem.model.recordings.markers
     models: dict[str, Any] = {"base": (answer.target, answer.base.x), "last": (answer.target, answer.extended.x)}
-    if answer.causes.steps:
-        models["last"] = (answer.causes.steps[-1].fit_target, answer.extended.x)
+    if answer.steps:
+        models["last"] = (answer.steps[-1].fit_target, answer.extended.x)
     if answer.law is not None and answer.law.last is not None:
         models["last"] = (answer.law.last.target, answer.law.last.fit.x)
     valid = measured.valid[..., : measured.markers]
@@ -30,7 +30,7 @@ def residual_dataset(answer: Answer) -> xr.Dataset:
     variables: dict[str, Any] = {f"residual_{name}": (along, part, {"units": "m"}) for name, part in residuals.items()}
     variables["time"] = (("recording", "row"), np.asarray(measured.time), {"units": "s"})
     coordinates: dict[str, Any] = {"recording": list(measured.names), "marker": list(markers), "axis": list("xyz")}
-    described = answer.causes.described
+    described = answer.described
     if described is not None:
         rows = described.search.ports
         coordinates |= {"port": [row.port.name for row in rows], "signal_time": described.search.centre}

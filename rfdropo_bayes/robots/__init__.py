@@ -1,36 +1,9 @@
 """Robot descriptions: geometry, cables, motors, markers and parameters, read from TOML and validated."""
 
-from rfdropo_bayes.robots.body import Body, PointMass
-from rfdropo_bayes.robots.cable import Cable, Channels
+from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.robots.catalogue import find_robot_file, known_robots
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in
 from rfdropo_bayes.robots.motor import Motor
-from rfdropo_bayes.robots.parameter import Parameter
-from rfdropo_bayes.robots.robot import OBJECT, CommandTiming, Marker, PushScene, Robot
+from rfdropo_bayes.robots.robot import OBJECT, PushScene, Robot
 from rfdropo_bayes.robots.sections import Cone, Cylinder, Disks, Tube, section_profile
 from rfdropo_bayes.robots.shape import robot_shape
-
-__all__ = [
-    "OBJECT",
-    "Body",
-    "Cable",
-    "Channels",
-    "CommandTiming",
-    "Cone",
-    "Cylinder",
-    "Disks",
-    "DriveTravel",
-    "Marker",
-    "Motor",
-    "Parameter",
-    "PointMass",
-    "PushScene",
-    "Robot",
-    "Travel",
-    "Tube",
-    "find_robot_file",
-    "known_robots",
-    "robot_shape",
-    "section_profile",
-    "travel_in",
-]

@@ -7,7 +7,7 @@ also be at rest in every row: an equilibrium found from the row before, without 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal, NamedTuple, Protocol, cast
 
@@ -188,12 +188,6 @@ class Engine:
         if self.backend.name == "jax":
             return {"engine": "jax", "precision": "float64", "device": jax.devices()[0].platform, **steps}
         return {"engine": "numba", "precision": self.backend.precision, "device": "cpu", **steps}
-
-    def recording(self, points: PointMap | NodePoints) -> Engine:
-        """The same engine in double precision, recording these points of the body in place of the markers."""
-        body: Any = self.body
-        backend = self.backend._replace(precision="float64")
-        return replace(self, body=body._replace(markers=points), backend=backend)
 
     def motion(
         self,

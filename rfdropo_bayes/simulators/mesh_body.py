@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.balance import Balance, tetrahedral_balance
 from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.mesh_points import NodePoints, joined
 from rfdropo_bayes.fem.rod import Rod, profile_rod
@@ -32,7 +31,7 @@ from rfdropo_bayes.fem.tetrahedra import (
 )
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import TetrahedralMesh
-from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
+from rfdropo_bayes.simulators.body_engine import Engine
 from rfdropo_bayes.simulators.commands import Commands, animated_on_grid
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -205,23 +204,6 @@ class MeshTrunkSimulator(RobotSimulator):
     def inputs(self, values: Values, commands: Commands) -> tuple[TetrahedralMaterial, Array, Array]:
         displacement = self.displacements(values, commands)
         return self.material(values), jnp.zeros_like(displacement[0]), displacement
-
-    def balance_of(self, inputs: tuple[TetrahedralMaterial, Array, Array], cube: CubeInputs | None) -> Balance:
-        """See `RobotSimulator`; the energies are of the body.
-
-        Raises:
-            InputError: the integrator is not implicit Euler; only for Euler do the states determine the velocities.
-        """
-        if self.engine.integrator != "euler":
-            raise InputError(
-                f"forces and energies of a mesh are not available with integrator {self.engine.integrator!r}",
-                where="balance",
-                remedy='use integrator = "euler" under [simulator], with shorter steps',
-            )
-        nodes = self.assembly.system.body.nodes
-        every = NodePoints(np.arange(nodes)[:, None], np.ones((nodes, 1)))
-        motion = self.engine.recording(every).motion(*inputs, cube=cube)
-        return tetrahedral_balance(self.assembly.system, inputs[0], motion.position, motion.tension, self.time_step)
 
     def displacements(self, values: Values, commands: Commands) -> Float[Array, "step cable"]:
         """Commanded cable displacements [m] at the end of every step; SOFA's limits belong to the engine."""

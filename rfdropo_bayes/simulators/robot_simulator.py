@@ -15,7 +15,6 @@ from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem import Material, Rod
-from rfdropo_bayes.fem.balance import Balance
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.robots import Robot, Travel
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend, CubeInputs, Engine
@@ -145,10 +144,6 @@ class RobotSimulator(ExtendedSimulator):
 
     def material(self, values: Values) -> Any:
         """Material of the body for these values, body mechanisms included."""
-        raise NotImplementedError
-
-    def balance_of(self, inputs: tuple[Any, Array, Array], cube: CubeInputs | None) -> Balance:
-        """Forces and energies after every step, of the rollout of these `inputs`."""
         raise NotImplementedError
 
     @property
@@ -289,29 +284,6 @@ class RobotSimulator(ExtendedSimulator):
             levels = jnp.concatenate([initial[None], command])
             loads += [mechanism.push(values, levels, path, self.time_step) for mechanism in pushing]
         return jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *loads) if loads else None
-
-    def balance(self, parameters: Values, commands: Commands) -> Balance:
-        """Forces on the body, its energies, work and losses of a rollout at the observation times; see `fem.balance`.
-
-        The computation is in double precision. Integrators other than implicit Euler need the reference engine, since
-        states alone do not determine the stages of a step. Mechanisms of sensing have no effect; only `rollout` reports
-        divergence.
-
-        Raises:
-            InputError: a name that is not a parameter of this simulator, cables with friction, or a mesh with another
-                integrator than implicit Euler.
-        """
-        values = self.complete(parameters)
-        if self.at_rest:
-            raise InputError("forces and energies need a dynamic motion", where="balance", remedy=DYNAMIC)
-        if self.loads(values, commands) is not None:
-            raise InputError(
-                "forces and energies are not available with laws that act on the body",
-                where="balance",
-                remedy="leave them out of [[model.laws]]",
-            )
-        found = self.balance_of(self.inputs(values, commands), self.body_inputs(values)[1])
-        return Balance(*(sample(series, commands) for series in found))
 
     def embodied(
         self,

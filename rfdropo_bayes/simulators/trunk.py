@@ -21,10 +21,8 @@ from rfdropo_bayes.fem import (
     profile_rod,
     refined,
 )
-from rfdropo_bayes.fem.balance import Balance
-from rfdropo_bayes.fem.stage_balance import stepped_balance
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine
+from rfdropo_bayes.simulators.body_engine import Engine
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.mechanisms import Mechanism, Values
@@ -100,17 +98,6 @@ class TrunkSimulator(RobotSimulator):
 
     def inputs(self, values: Values, commands: Commands) -> tuple[Material, Array, Array]:
         return self.material(values), *self.wound(values, commands, self.time_step)
-
-    def balance_of(self, inputs: tuple[Material, Array, Array], cube: CubeInputs | None) -> Balance:
-        """See `RobotSimulator`; the energies are of the body."""
-        system, engine = self.assembly.system, self.engine
-        material, start, displacement = inputs
-        prepared, state, _ = engine.initial(material, start)
-        state = state._replace(commanded=start)
-        around = () if cube is None else (engine.scene, cube.cube)
-        if cube is not None:
-            state = state._replace(cube=cube.start)
-        return stepped_balance(system, prepared, state, displacement, self.time_step, engine.integrator, *around)
 
     def material(self, values: Values) -> Material:
         body = self.assembly.system.body

@@ -19,7 +19,7 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
-from rfdropo_bayes.data import DataSpec, RecordingEntry, Trajectory, load_recordings, one_at_a_time
+from rfdropo_bayes.data import RecordingEntry, Trajectory, load_recordings, one_at_a_time
 from rfdropo_bayes.data.given_recordings import given_recording, given_recordings
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
@@ -345,7 +345,7 @@ def _recorded(fit: Calibration, entry: RecordingEntry) -> tuple[Calibration, Tra
     if read.data is None:
         where = model.name if model.file is None else str(model.file.path)
         raise InputError("the experiment has no [data]", where=where, remedy="name the format of the recordings")
-    data = _alone(read.data, entry)
+    data = changed(read.data, where="[data]", fit=[entry], test=[], missing="mask")
     recordings = load_recordings(data, model.folder)
     if len(recordings) > 1:
         raise one_at_a_time(read.data, entry.observations, len(recordings), "adapt to")
@@ -409,11 +409,6 @@ def _adapted(model: Model, model_error: ModelError, recording: Trajectory, group
         correlation_time=model_error.correlation_time,
     )
     return Model.of(replace(model.spec, noise=STATED, stated=noise, groups=groups), model.settings)
-
-
-def _alone(data: DataSpec, entry: RecordingEntry) -> DataSpec:
-    """[data] with one recording to fit, whose lost markers are left out."""
-    return changed(data, where="[data]", fit=[entry], test=[], missing="mask")
 
 
 def session_scopes(fit: Calibration, model: Model, recordings: Sequence[str], session: str) -> Scopes:

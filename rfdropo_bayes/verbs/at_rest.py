@@ -49,14 +49,14 @@ def rows_of(recordings: Sequence[Trajectory], markers: Sequence[str], late: floa
     return Rows(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def spread_rows(rows: Rows, most: int, seed: int = 0) -> np.ndarray:
+def spread_rows(rows: Rows, most: int) -> np.ndarray:
     """Indices of at most ``most`` rows with a seen marker, in order: one half random, the other half with commands
     farthest from all chosen rows.
     """
     usable = np.flatnonzero(np.isfinite(rows.position).all(axis=2).any(axis=1))
     if len(usable) <= most:
         return usable
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     chosen = list(random.choice(len(usable), most // 2, replace=False))
     command = rows.command[usable]
     scale = command.std(axis=0)

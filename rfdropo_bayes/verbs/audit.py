@@ -138,7 +138,7 @@ def audit(
     start = start_values(fit)
     problem = build_problem(spec, table, runs, test, chosen, start=start, workshop=workshop, groups=groups)
     tables = model.record({"title": model.title, "seed": chosen}, {})
-    doubts = cautions_of_audit(model, [*runs, *test], nominal_paths(problem))
+    doubts = cautions_of_audit(model, [*runs, *test], fitted_paths(problem, start or {}))
 
     def audited(out: Path | None) -> Audit:
         journal = None if out is None else Journal(out / JOURNAL, resume=resume)
@@ -159,12 +159,15 @@ def audit(
     return answered
 
 
-def nominal_paths(problem: AuditProblem) -> list[Paths]:
-    """The fitted recordings beside the nominal model; empty if an object is pushed, or a rollout fails."""
+def fitted_paths(problem: AuditProblem, start: Mapping[str, float]) -> list[Paths]:
+    """The fitted recordings beside the model at the start of the audit: nominal, but for values of an earlier fit.
+
+    Empty if an object is pushed, or a rollout fails.
+    """
     if "object_pose" in problem.lanes.fields:
         return []
     recordings = problem.model.recordings.of(range(len(problem.trajectories)))
-    values = problem.coordinates.nominal
+    values = {**problem.coordinates.nominal, **start}
     theta = np.tile([values[name] for name in problem.lanes.physical], (len(recordings.names), 1))
     fields, status = problem.lanes.roll(theta, np.zeros((len(theta), 7)), recordings.commands)
     valid = np.asarray(recordings.line.valid)
@@ -256,6 +259,7 @@ def build_problem(
         commands = stack_commands([commands_of(whole, trajectory) for trajectory in trajectories])
         return lanes(finer, whole), commands
 
+    matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
     return AuditProblem(
         lanes(spec, simulator),
         None if isinstance(robot, BlackBox) else half(robot),
@@ -265,7 +269,7 @@ def build_problem(
         candidates,
         _stated(spec, model, fitted[0]),
         start,
-        _rules(table),
+        Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters),
         seed,
         {name: why for name, why in left_out.items() if name not in table.exclude},
         groups,
@@ -290,12 +294,6 @@ def _something_asked(table: AuditTable, groups: Groups | None) -> None:
             where="[audit] library",
             remedy="set library = true, or ports = true without --between",
         )
-
-
-def _rules(table: AuditTable) -> Rules:
-    """The rules of an audit from its table [audit]."""
-    matters = None if table.matters_mm is None else 1e-3 * table.matters_mm
-    return Rules(bootstraps=table.bootstraps, minutes=table.minutes, matters=matters)
 
 
 def _named(

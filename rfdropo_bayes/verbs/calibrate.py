@@ -187,7 +187,14 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
         problem = problem.telling(progress.spend)
         result = run(problem, method, config, key, checkpoint_dir=kept, resume=resume, progress=progress)
     problem = problem.holding(result.fixed)
-    attributes = {**_attributes(model, seed, [*runs, *test]), BEGUN: common_beginning(runs)}
+    attributes = {
+        "seed": seed,
+        "robot": model.name,
+        "data_sha256": [trajectory.sha256 for trajectory in [*runs, *test]],
+        "versions": software_versions(),
+        **stated_integrator(model.spec),
+        BEGUN: common_beginning(runs),
+    }
     record, unmatched = record_posterior(asked, problem, result, predicting, attributes, show=show)
     record = with_doubts(record, cautions_of_fit(model, [*runs, *test], record.recordings))
     facts = gather_facts(model.title, seed, problem, result, runs, test, record, unmatched)
@@ -438,13 +445,3 @@ def known_noise(problem: CalibrationProblem) -> dict[str, Any]:
     """The noise of the positions as an attribute of the posterior, if it is not a parameter."""
     known, markers = problem.model.markers.known, problem.model.recordings.markers
     return {} if known is None else {KNOWN_NOISE: {"markers": list(markers), **known.as_dict()}}
-
-
-def _attributes(model: Model, seed: int, trajectories: Sequence[Trajectory]) -> dict[str, Any]:
-    return {
-        "seed": seed,
-        "robot": model.name,
-        "data_sha256": [trajectory.sha256 for trajectory in trajectories],
-        "versions": software_versions(),
-        **stated_integrator(model.spec),
-    }

@@ -19,6 +19,7 @@ from rfdropo_bayes.data.streams import side_by_side
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.verbs.column_units import (
     ANGLES,
+    FORCE,
     UNITS,
     WORD,
     Unit,
@@ -35,7 +36,6 @@ TIME = re.compile(
     r"^\W*(t|ts|time|timestamp|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock)(?![a-z])", re.IGNORECASE
 )
 AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
-FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d", re.IGNORECASE)
 MEASURED = re.compile(
     r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
 )
@@ -58,8 +58,8 @@ NO_PLACE = re.compile(
     re.IGNORECASE,
 )
 """Columns in x, y and z that are no positions."""
-DERIVED = re.compile(r"(?<![a-z])[vwq][_. ]?\*", re.IGNORECASE)
-"""The same under a single letter: velocities and quaternions, if there are positions beside them."""
+DERIVED = re.compile(r"(?<![a-z])[fvwq][_. ]?\*", re.IGNORECASE)
+"""The same under a single letter: forces, velocities and quaternions, if there are positions beside them."""
 RATE = re.compile(r"veloc|effort|accel", re.IGNORECASE)
 BODY = re.compile(r"^Rigid Body\.|\.rigidbodies\[[^]]*\]\.pose", re.IGNORECASE)
 """Solved poses of bodies: if there are any, the underlying markers are not used."""
@@ -107,6 +107,7 @@ class Guess(NamedTuple):
     seen: Float[np.ndarray, "row marker 3"]  # marker positions in the first rows, both in the file's units
     counts_per_turn: float | None = None  # counts per turn of the spool, if a unit is "counts"
     sample_time: float | None = None  # given time from row to row [s]; None for rows with times, or without any
+    unwrap: Mapping[str, float] = {}  # turn of each counter that begins anew in the first rows, by its column
 
     @property
     def counts(self) -> bool:
@@ -140,8 +141,10 @@ def guess_columns(
         sending = CsvTable(sent, (), names=command_names, machine_written=False)
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name != clock]
-    commands = _commands(source, free, any_name=own or sent is not None)
+    measured = [] if sent is not None else angles or tensions
+    commands = _commands(source, free, measured, any_name=own or sent is not None)
     _check_columns(path, format, columns, positions, commands)
+    tensions, angles = ([] if commands == measured else other for other in (tensions, angles))
     tensions = tensions if len(tensions) == len(commands) else []
     units = {
         "command_unit": command_unit(sending, source, commands),
@@ -281,8 +284,10 @@ def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
     return {common: names for common, names in places.items() if not DERIVED.search(common)} or places
 
 
-def _commands(table: pd.DataFrame, names: list[str], *, any_name: bool) -> list[str]:
-    """Columns of commands; if no name matches, all columns in files of a user's own format."""
+def _commands(table: pd.DataFrame, names: list[str], measured: list[str], *, any_name: bool) -> list[str]:
+    """Columns of commands. If no name matches: all columns in files of a user's own format, or the ``measured`` angles
+    or forces of drives whose commands nobody recorded.
+    """
     sent = [name for name in names if SENT.search(name)]
     names = sent or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
     turns = {name for four in _quaternions(table, names) for name in four}
@@ -292,6 +297,8 @@ def _commands(table: pd.DataFrame, names: list[str], *, any_name: bool) -> list[
         [name for name in names if SENT.search(name) and not RATE.search(name)]
         or [name for name in called if not BESIDE.search(name) and not RATE.search(name)]
         or called
+        or ([name for name in names if not BESIDE.search(name)] if any_name else [])
+        or measured
         or (names if any_name else [])
     )
 
@@ -347,7 +354,7 @@ def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list
     """Names that robot files allow, made of the common name of each marker's columns, without some words."""
     names = []
     for number, common in enumerate(commons, start=1):
-        words = [word for word in WORD.findall(common) if word not in UNITS]
+        words = [word for word in WORD.findall(common) if word not in {*UNITS, "in"}]
         name = "_".join(word for word in words if structure is None or not structure.fullmatch(word))
         names.append(name if re.match(r"[a-z]", name) else f"m{name or number}")
     return names if len(set(names)) == len(names) else [f"m{k}" for k in range(1, len(names) + 1)]

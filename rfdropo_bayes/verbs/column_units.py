@@ -18,10 +18,15 @@ from rfdropo_bayes.data.sample_times import PER_SECOND, row_interval
 from rfdropo_bayes.errors import InputError
 
 WORD = re.compile(r"[a-z0-9]+")
-UNITS = {unit: unit for unit in ("mm", "cm", "m", "deg", "rad")} | dict.fromkeys(
-    ("count", "counts", "cnt", "cnts", "tick", "ticks", "pulse", "pulses", "steps", "qc"), named_columns.COUNTS
+UNITS = (
+    {unit: unit for unit in ("mm", "cm", "m", "deg", "rad")}
+    | dict.fromkeys(
+        ("count", "counts", "cnt", "cnts", "tick", "ticks", "pulse", "pulses", "steps", "qc"), named_columns.COUNTS
+    )
+    | {"inch": "in", "inches": "in", "grad": "deg"}
 )
-"""Words in the name of a column, and their unit."""
+"""Words in the name of a column, and their unit; "Grad" is German for degrees."""
+INCHES = re.compile(r"[_ .\[(]in[\])]?$")  # how a name ends whose unit is "in", which is also a word
 FOREIGN = {
     "%": re.compile(r"%|(?<![a-z])(percent|percentage|pct|duty|pwm)(?![a-z])", re.IGNORECASE),
     "V": re.compile(r"volt|[_ .\[(]m?V[\])]?$|^m?V$"),
@@ -33,6 +38,8 @@ FOREIGN = {
     "N": re.compile(r"newton|[_ .\[(]N[\])]?$|^N$"),
 }
 """Units of commands that are neither a length of cable nor an angle of a motor."""
+FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d|(?<![a-z])f_", re.IGNORECASE)
+ENCODER = re.compile(r"(?<![a-z])enc(oder)?(?![a-z])", re.IGNORECASE)
 PRESSURE = re.compile(r"(?<![a-z])pressures?(?![a-z])", re.IGNORECASE)
 PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0  # largest pressures in chambers of soft robots in kPa, and in bar
 ANGLES = ("rad", "deg", named_columns.COUNTS)
@@ -55,6 +62,8 @@ NOT_TOLD, NOT_WHOLE = 2.0, 4.0
 RESTING = 3e-3  # share of the largest coordinate: markers that spread by less rest, and show the rate of noise
 MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
 """Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
+COUNTS_ABOVE = 1e3  # largest of whole numbers that no cable moves in mm, nor a motor in deg
+METRIC = ("m", "cm", "mm")  # units that are told by a size: inches and centimetres are within a factor of three
 METRES_UP_TO = 0.2  # largest plausible pull of a cable of a soft arm [m]
 
 
@@ -99,9 +108,12 @@ def unit_in_names(
 
 
 def _of_column(table: CsvTable, name: str, known: Collection[str]) -> str | None:
-    below = {UNITS[word] for word in WORD.findall(table.units.get(name, "").lower()) if UNITS.get(word) in known}
-    units = below or {UNITS[word] for word in WORD.findall(name.lower()) if UNITS.get(word) in known}
-    return units.pop() if len(units) == 1 else None
+    for words in (table.units.get(name, ""), name):
+        units = {UNITS[word] for word in WORD.findall(words.lower()) if UNITS.get(word) in known}
+        units |= {"in"} if "in" in known and (words == "in" or INCHES.search(words)) else set()
+        if units:
+            return units.pop() if len(units) == 1 else None
+    return None
 
 
 def _kind(unit: str) -> str:
@@ -138,8 +150,11 @@ def unit_of_places(start: Float[np.ndarray, "marker 3"], heights: Mapping[str, f
     known = float(height[j] - (0.0 if single else height[i]))
     if not (np.isfinite(distance) and distance > 0.0 and known > 0.0):
         return None
-    unit = min(METRES, key=lambda unit: abs(np.log(distance * METRES[unit] / known)))
-    if abs(np.log(distance * METRES[unit] / known)) > np.log(BENT if not single else UPRIGHT):
+    off = {unit: abs(np.log(distance * METRES[unit] / known)) for unit in METRES}
+    unit = min(METRIC, key=off.__getitem__)
+    most = np.log(BENT if not single else UPRIGHT)
+    unit = unit if off[unit] <= most else "in"
+    if off[unit] > most:
         return None
     words = f"{names[j]} is {distance:.3g} from " + ("the origin" if single else names[i])
     return Unit(unit, evidence=f"{words}, and {1e3 * known:.4g} mm on the robot")
@@ -156,11 +171,16 @@ def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) ->
     if all(ANGLE.search(name) for name in names):
         return angle_unit(values, names)
     largest = float(np.nanmax(np.abs(values[list(names)].to_numpy())))
+    if all(FORCE.search(name) for name in names):
+        return Unit("N", evidence=f"{_span(names)} are called forces, and reach {largest:.3g}")
     if all(PRESSURE.search(name) for name in names):
         unit = "Pa" if largest > PASCALS_ABOVE else "kPa" if largest > KILOPASCALS_ABOVE else "bar"
         return Unit(unit, evidence=f"{_span(names)} reach {largest:.3g}")
-    whole = all(pd.api.types.is_integer_dtype(values[name]) for name in names)
-    evidence = f"{_span(names)} reach {largest:.3g}" + (" in whole numbers, as counts do" if whole else "")
+    evidence = f"{_span(names)} reach {largest:.3g}"
+    if all(pd.api.types.is_integer_dtype(values[name]) for name in names):
+        evidence += " in whole numbers, as counts do"
+        if largest > COUNTS_ABOVE or all(ENCODER.search(name) for name in names):
+            return Unit(named_columns.COUNTS, evidence=evidence)
     return Unit("mm" if largest > METRES_UP_TO else "m", evidence=evidence)
 
 

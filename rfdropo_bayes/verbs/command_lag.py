@@ -20,6 +20,8 @@ JUST_BEFORE = 1e-6  # [s] before a row: a command that is sent in it does not ac
 RIDGE = 1e-6  # ridge penalty of the maps, as a share of the mean square of their features
 CLEARLY = 0.9  # ratio of the root mean square residuals of two maps below which the better map is reported
 
+APART = 0.3  # the same ratio of two neighbours' commands below which each row is a pose of its own
+
 
 class LagError(NamedTuple):
     """Residual of the markers' motion after a quadratic map of the commands."""
@@ -31,6 +33,17 @@ class LagError(NamedTuple):
 def errors_by_row(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2)) -> list[LagError]:
     """Residuals if each row shows the effect of the command some rows before, for each lag."""
     return [LagError(lag, _map_error([(own, _shifted(sent, lag)) for own, sent in _series(runs)])) for lag in lags]
+
+
+def apart(run: Trajectory) -> str | None:
+    """Why each row is a pose of its own, in words: it shows one command, and nothing of the command before or after.
+
+    None for rows of a continuous motion.
+    """
+    one, other = sorted(each.error for each in errors_by_row([run], (0, 1)))
+    if one >= APART * other:
+        return None
+    return f"a map of one row's command leaves {1e3 * one:.3g} mm, of its neighbour's {1e3 * other:.3g} mm"
 
 
 def best_delay(runs: Sequence[Trajectory]) -> float:

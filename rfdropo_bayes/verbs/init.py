@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
+from rfdropo_bayes.data.counters import Column, Motion, quoted_key, read_on, turns_of, wraps_of
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
 from rfdropo_bayes.errors import InputError
@@ -25,7 +26,8 @@ from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.command_lag import errors_by_row
-from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors, parts_of
+from rfdropo_bayes.verbs.days import Piece, days_of, group_lines, pieces_of
+from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
@@ -37,6 +39,9 @@ CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)  # formats that come from motion c
 FAR_ORIGIN = 0.1  # share of the body's length: a frame whose origin lies farther from the base is moved there
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
+
+
+ROLES: tuple[Literal["fit", "test"], ...] = ("fit", "test")
 
 
 def quoted(value: object) -> str:
@@ -109,6 +114,18 @@ def with_counts(guess: Guess, counts: float | None, unit_given: bool) -> Guess:
     return guess._replace(counts_per_turn=counts, command_unit=unit)
 
 
+def with_turns(guess: Guess) -> Guess:
+    """A guess whose counters are read on across their turns, if they jump by a known turn and no marker follows."""
+    rows = np.arange(len(guess.sent), dtype=float)
+    if len(guess.seen) != len(rows):
+        return guess
+    turns = turns_of(guess.command_unit, guess.counts_per_turn, guess.sent)
+    columns = [Column(name, own, turns) for name, own in zip(guess.commands, guess.sent.T, strict=True)]
+    wraps = wraps_of(columns, Motion(rows, rows, guess.seen.reshape(len(rows), -1)))
+    unwrap = {name: each.turn for name, each in wraps.items() if each.known}
+    return guess._replace(unwrap=unwrap, sent=read_on(guess.sent, guess.commands, unwrap))
+
+
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:
     """A guess with units that suit the robot, and without tensions of motors with two cables."""
     if outline.pairs and guess.tensions:
@@ -161,10 +178,11 @@ def write_first_files(
         data: list[str], slow: str | None = None, first: Trajectory | None = None, seen: Frame | None = None
     ) -> Experiment:
         model = _model(made, outline, guess, first, seen, rests=slow is not None)
-        lines = [*_head(outline.name), *data, *_simulator(slow), *model]
+        lines = [*_head(outline.name), *data, *_simulator(slow), *model, *group_lines(days)]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
+    days = days_of(recordings)
     if guess is None:
         write(_random_commands(outline))
         return robot, experiment
@@ -179,9 +197,10 @@ def write_first_files(
         cables=outline.cable_names(),
     )
     plain = write(tables())
-    first = _first_recording(plain, folder)
-    if first is None:
+    runs = _recordings(plain, folder)
+    if not runs:
         return robot, experiment
+    first = runs[0]
     usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
     outline = replace(outline, usual_command=usual or None)
     robot.write_text(robot_text(outline), encoding="utf-8")
@@ -189,14 +208,19 @@ def write_first_files(
     timed = guess.time is not None or guess.sample_time is not None
     frame = [f"{line}  # ASSUMED: found from the first row" for line in _frame(plain, made, guess)]
     slow = slow_motion(made, first) if timed else NO_MOTION
-    parts = parts_of(first, len(recordings), rests=slow is not None, timed=timed)
+    pieces = (
+        pieces_of([len(run.time) for run in runs], days, rests=slow is not None, timed=timed)
+        if len(runs) == len(recordings)
+        else None
+    )
     poses = _of_poses(first, timed) if slow is not None and guess.command_time is None else None
-    tables = partial(tables, parts=parts, poses=poses)
+    tables = partial(tables, pieces=pieces, poses=poses)
     placed = write(tables(frame=frame), slow, first)
-    seen = _first_recording(placed, folder)
+    runs = _recordings(placed, folder)
     columns = None if placed.data is None else placed.data.columns
-    if seen is None or columns is None or not usual:
+    if not runs or columns is None or not usual:
         return robot, experiment
+    seen = runs[0]
     bends = outline.sets_bend is not None
     registration = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed, bends=bends)
     ordered, order = guess, None
@@ -242,14 +266,14 @@ def _of_poses(first: Trajectory, timed: bool) -> str | None:
     return f"a quadratic map of the commands of a pose's own row leaves {errors}"
 
 
-def _first_recording(experiment: Experiment, folder: Path) -> Trajectory | None:
-    """The first recording to fit; None if it cannot be read: check reports the fault next."""
+def _recordings(experiment: Experiment, folder: Path) -> list[Trajectory]:
+    """The recordings of fit and test; empty if one cannot be read: check reports the fault next."""
     if experiment.data is None:
-        return None
+        return []
     try:
-        return load_recordings(experiment.data, folder)[0]
+        return [run for role in ROLES for run in load_recordings(experiment.data, folder, role)]
     except InputError:
-        return None
+        return []
 
 
 def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
@@ -276,9 +300,9 @@ def _head(name: str) -> list[str]:
 
 
 def _entries(
-    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, parts: Sequence[Mapping[str, Any]]
-) -> list[str]:
-    """The recordings as entries of fit and test; a single recording twice if its rows are divided."""
+    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, pieces: Sequence[Piece] | None
+) -> tuple[list[str], list[str]]:
+    """The entries of fit and of test; the last recording is the test if there are no pieces."""
     entries: list[dict[str, Any]] = [{"observations": os.path.relpath(path, folder)} for path in recordings]
     if commands:
         sent = [os.path.relpath(path, folder) for path in commands]
@@ -287,14 +311,15 @@ def _entries(
         episodes = lerobot.episode_numbers(recordings[0])
         shares = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
         entries = [{**entries[0], "episodes": share} for share in shares]
-    if parts and len(entries) in (1, len(recordings)):
-        whole = entries * len(parts) if len(entries) == 1 else entries
-        entries = [{**entry, **part} for entry, part in zip(whole, parts, strict=True)]
-    tables = [", ".join(f"{key} = {quoted(value)}" for key, value in entry.items()) for entry in entries]
-    return [
-        quoted(entry["observations"]) if len(entry) == 1 else f"{{{text}}}"
-        for entry, text in zip(entries, tables, strict=True)
-    ]
+        pieces = None
+    last = len(entries) - 1
+    chosen = pieces or [Piece(number, {}, 0 < number == last) for number in range(len(entries))]
+    said: tuple[list[str], list[str]] = ([], [])
+    for piece in chosen:
+        entry = {**entries[piece.file], **piece.rows}
+        text = ", ".join(f"{key} = {quoted(value)}" for key, value in entry.items())
+        said[piece.tested].append(quoted(entry["observations"]) if len(entry) == 1 else f"{{{text}}}")
+    return said
 
 
 def assumed_of_columns(guess: Guess) -> list[str]:
@@ -318,19 +343,18 @@ def data_tables(
     gravity: str = "",
     frame: Sequence[str] = (),
     cables: Sequence[str] = (),
-    parts: Sequence[Mapping[str, Any]] = (),
+    pieces: Sequence[Piece] | None = None,
     poses: str | None = None,
     order: str | None = None,
 ) -> list[str]:
     """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
 
     ``frame`` are the lines of axes and origin with their evidence, if a recording determines them; ``cables`` the
-    robot's, one for each command, if tensions of them were measured; ``parts`` see `parts_of`; ``poses`` the reason to
-    take each command for that of the pose in its row; ``order`` the reason for another order of the commands than the
-    file's.
+    robot's, one for each command, if tensions of them were measured; ``pieces`` see `pieces_of`; ``poses`` the reason
+    to take each command for that of the pose in its row; ``order`` the reason for another order of the commands than
+    the file's.
     """
-    entries = _entries(folder, recordings, commands, guess, parts)
-    fit, test = (entries, []) if len(entries) == 1 else (entries[:-1], entries[-1:])
+    fit, test = _entries(folder, recordings, commands, guess, pieces)
     lost = lost_positions(recordings, guess)
     counted = f" ({', '.join(f'{name}: {count} empty cells' for name, count in lost.items())})" if lost else ""
     masked = [f'missing = "mask"  # positions that motion capture lost are left out{counted}']
@@ -343,6 +367,9 @@ def data_tables(
     if guess.motor_angles:
         optional += [f"motor_angles = {quoted(guess.motor_angles)}", _unit_line(guess, "motor_angle_unit")]
     counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
+    wraps = ", ".join(f"{quoted_key(name)} = {turn:.10g}" for name, turn in guess.unwrap.items())
+    if wraps:
+        counts.append(f"unwrap = {{{wraps}}}  # ASSUMED: the columns jump by this turn, and no marker follows")
     unused = [f"# not used: {', '.join(guess.unused)}"] if guess.unused else []
     return [
         "[data]",

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import DataSpec, load_recordings
-from rfdropo_bayes.data.named_columns import ROWS
+from rfdropo_bayes.data.named_columns import METRES, ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.model.experiment import load_experiment
@@ -21,7 +21,7 @@ from rfdropo_bayes.verbs.column_names import Guess
 from rfdropo_bayes.verbs.column_units import ANGLES
 from rfdropo_bayes.verbs.init import data_tables, quoted, with_given
 
-OF_CABLE = {"m": ("m", "cm", "mm"), "rad": ANGLES}  # units of commands in recordings, for each unit of a simulator
+OF_CABLE = {"m": tuple(METRES), "rad": ANGLES}  # units of commands in recordings, for each unit of a simulator
 
 
 def write_model_experiment(

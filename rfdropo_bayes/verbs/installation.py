@@ -7,7 +7,6 @@ recording: shares of the largest pull and of the body's length, and angles of a 
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
 
 import numpy as np
 
@@ -25,11 +24,10 @@ TILT, TURN = 0.1, 0.5
 """Standard deviations of the frame's tilt, and of its turn about the body's axis [rad]. That arm's frame was turned by
 0.3 rad."""
 GAIN = 0.1  # standard deviation of the relative error of a command in metres of cable
-UNKNOWN = 0.5  # the same of a robot whose cables' distance from the axis, or whose length, was not given
-FEWEST_ROWS = 60  # rows of a recording whose last third, 20 rows, is worth a test
-ROWS_AT_REST = 200
-"""Rows at rest that a fit takes, seven for each parameter of a robot with nine cables. There 405 of 1,620 rows left the
-error on unseen rows as it was; with 203 the minutes hold twice the rollouts."""
+UNKNOWN = 0.5
+"""The same of a robot whose cables' distance from the axis, or whose length, was not given; and of pressures and inputs
+of drives, whose force per command no answer states."""
+UNSTATED = ("Pa", "-")  # units of commands whose force per command is not stated
 
 
 def largest_pull(robot: Robot, recording: Trajectory) -> float:
@@ -42,7 +40,7 @@ def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[st
     """Mechanisms of the base model: the measuring frame, the body's stiffness in tension, the gain of the drives, the
     scale of lengths if the body's length was ``assumed``, and of a robot with several sections, whose cables pull
     against each other and whose sections are turned by hand, the stretch and the azimuths of its cables."""
-    gain = ["command_gain"] if robot.command_unit == "m" else []
+    gain = ["command_gain"] if robot.command_unit in ("m", *UNSTATED) else []
     scale = ["camera_scale"] if "length" in assumed else []
     sections = ["cable_compliance", "guide_azimuth"] if _pulled_by_section(robot) else []
     return ["axial_stiffness", "camera_rotation", *gain, *scale, *sections]
@@ -83,38 +81,13 @@ def installed_priors(
     if robot.command_unit == "m":
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
+    if robot.command_unit in UNSTATED:
+        normal("command_gain_error", UNKNOWN, "force of a drive over that of the robot file, less 1")
     if "length" in assumed:
-        normal("camera_scale_error", UNKNOWN, "lengths over those of the robot file, less 1")
+        normal("camera_scale_error", UNKNOWN, "lengths over the robot file's lengths, less 1")
     if _pulled_by_section(robot):
         lines.append("cable_compliance = {}  # stretch of a cable over its tension")
         wide, words = (TURN, "which was not given") if "segment_azimuths" in assumed else (TILT, "over the drawing's")
         normal("guide_azimuth_error", wide, f"azimuth of the cables of a channel, {words}")
     lines.append("axial_stiffness = {}  # in tension, over that which the profile has for its bending")
     return lines
-
-
-def parts_of(recording: Trajectory | None, recordings: int, *, rests: bool, timed: bool) -> list[dict[str, Any]]:
-    """Rows of each entry of fit and test, the last of which is the test: ``rows`` and ``every``; empty for all rows.
-
-    The last third of a single recording is the test. Poses without times have no order, so rows between the
-    fitted ones are the test if there are enough.
-
-    Args:
-        recording: the first recording.
-        recordings: their number.
-        rests: whether every row is an equilibrium; a fit may then leave out rows.
-        timed: whether rows have times.
-    """
-    count = 0 if recording is None else len(recording.time)
-    alone, last = recordings == 1, count - 1
-    fitted = count if alone and not timed else 2 * count // 3 if alone else (recordings - 1) * count
-    every = max(1, fitted // ROWS_AT_REST) if rests else 1
-    thinned = {"every": every} if every > 1 else {}
-    if not alone:
-        return [thinned] * (recordings - 1) + [{}] if thinned else []
-    if count < FEWEST_ROWS:
-        return []
-    if thinned and not timed:
-        return [{"rows": [0, last], **thinned}, {"rows": [every // 2, last], **thinned}]
-    cut = 2 * count // 3
-    return [{"rows": [0, cut - 1], **thinned}, {"rows": [cut, last]}]

@@ -18,6 +18,7 @@ from rfdropo_bayes.robots import Robot
 FAR = 0.4
 """Share of the robot's length: undeformed markers that are farther off than this, root mean square, are looked at."""
 NEAR = 0.15  # share of the robot's length; a remedy that brings the markers this near is reported as the cause
+PULLED = 0.25  # share of the largest command with which a recording starts bent: its first row shows no frame
 STRETCHED = 1.15  # ratio to the distance of two markers on the undeformed robot above which they are reported
 
 
@@ -80,7 +81,7 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     """Possible faults of axes, origin, units or the order of markers, in words; empty if none is found.
 
     A soft robot hangs or rests bent, so only a first row far from the undeformed robot is examined, and a cause is
-    named only if it brings the markers near.
+    named only if it brings the markers near. A recording that starts under a large command may start anywhere.
 
     Args:
         robot: robot with the undeformed markers.
@@ -95,10 +96,18 @@ def placement_hints(robot: Robot, trajectory: Trajectory, columns: CsvColumns | 
     if _rms(start.first - start.rest) <= FAR * length:
         return hints
     cause = _cause(start, length, Read.by(columns))
+    if cause is None and _starts_pulled(trajectory):
+        return hints
     head = f"the first row is {float(f'{1e3 * _rms(start.first - start.rest):.2g}'):g} mm off the undeformed robot"
     if cause is None and len(start.names) == 1 < len(trajectory.marker_names):
         cause = f"only {start.names[0]} is seen in it: too few markers to name a cause"
     return [*hints, f"{head}; {cause or 'look at axes, origin, units, the order of markers and their point_m'}"]
+
+
+def _starts_pulled(trajectory: Trajectory) -> bool:
+    """Whether the command before the first row is large."""
+    first, largest = np.abs(trajectory.initial_command).max(), np.abs(trajectory.command).max(initial=0.0)
+    return bool(first > PULLED * largest)
 
 
 def frame_lines(robot: Robot, first: Float[np.ndarray, "marker 3"], columns: CsvColumns) -> list[str]:

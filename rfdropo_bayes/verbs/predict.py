@@ -85,11 +85,29 @@ def predict(
     model = model_of(given_fit(fit, "predict"))
     record = fit.record
     spec = model.spec
-    _check_noise(record, spec.noise)
+    fitted_noise = record.attrs.get(NOISE, spec.noise)  # earlier posteriors lack it
+    if spec.noise != fitted_noise:
+        raise InputError(
+            f"the posterior was fitted with noise = {fitted_noise!r}, the experiment says {spec.noise!r}",
+            where="[model] noise",
+            remedy=f"add --set model.noise={fitted_noise}, or predict with config.toml of the posterior's folder",
+        )
     if isinstance(commands, tuple) and len(commands) == 2 and not isinstance(commands[0], Trajectory):
-        unseen = _commanded(model, commands[0], commands[1], start)
+        times, values = (np.asarray(part, dtype=float) for part in commands)
+        names, unit = model.simulator.channel_names, model.simulator.command_unit
+        unseen = commands_alone(
+            Origin("commands", model.name, "memory"),
+            SentCommands(times, values, unit, names).trusted(),
+            model.simulator.marker_names,
+            start=None if start is None else np.asarray(start, dtype=float)[None],
+        )
     elif isinstance(commands, str | Path):
-        unseen = _unseen(model, str(commands), start, record.attrs.get(BEGUN), episode)
+        data = model.settings.data
+        if data is None:
+            remedy = "name the format of the commands"
+            raise InputError("the experiment has no [data]", where=_path(model), remedy=remedy)
+        begun = record.attrs.get(BEGUN)
+        unseen = load_unseen(data, model.folder, str(commands), start, begun=begun, episode=episode)
     else:
         unseen = first_row_only(given_recording(commands, "predict"))
     asked = {"group": group, "seed": seed, "episode": episode}
@@ -99,13 +117,13 @@ def predict(
     scopes = fitted_scopes(fit)
     noise = _known_noise(spec, record.attrs.get(KNOWN_NOISE), sample_time(unseen.time))
     program = TrajectoryModel.of_positions(simulator, scopes, [unseen], spec.noise, *noise)
-    values = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
+    posterior = thin({info.name: record.posterior[info.name] for info in record.free}, draws)
     fitted = record.attrs.get(FITTED, sorted({info.scope.owner for info in record.free if info.scope.owner}))
     slow = _slow_error(record, unseen, groups, scopes)
     drawn = predict_new(
         program,
         [unseen],
-        values,
+        posterior,
         jax.random.key(model.settings.seed if seed is None else seed),
         chunk=simulator.lanes,
         fitted=fitted,
@@ -146,14 +164,6 @@ def predict(
 
 def _path(model: Model) -> str:
     return model.name if model.file is None else str(model.file.path)
-
-
-def _unseen(model: Model, commands: str, start: Any, begun: str | None, episode: int | None) -> Trajectory:
-    """The commands of a file in the format of the model's experiment."""
-    data = model.settings.data
-    if data is None:
-        raise InputError("the experiment has no [data]", where=_path(model), remedy="name the format of the commands")
-    return load_unseen(data, model.folder, commands, start, begun=begun, episode=episode)
 
 
 def _slow_error(
@@ -201,29 +211,6 @@ def fitted_scopes(fit: Calibration) -> Scopes:
     model, record = model_of(fit), fit.record
     fixed = fixed_values(model.spec, model.simulator)
     return Scopes.read(record.free, model_specs(model.spec, model.simulator), fixed, record.fixed)
-
-
-def _commanded(model: Model, time: Any, command: Any, start: Any) -> Trajectory:
-    """Commands as a recording whose measurements are unknown, but for the start pose."""
-    simulator = model.simulator
-    times, values = np.asarray(time, dtype=float), np.asarray(command, dtype=float)
-    return commands_alone(
-        Origin("commands", model.name, "memory"),
-        SentCommands(times, values, simulator.command_unit, simulator.channel_names).trusted(),
-        simulator.marker_names,
-        start=None if start is None else np.asarray(start, dtype=float)[None],
-    )
-
-
-def _check_noise(record: PosteriorRecord, noise: str) -> None:
-    """Raise an InputError if an experiment's noise model differs from a posterior's."""
-    fitted = record.attrs.get(NOISE, noise)  # earlier posteriors lack it
-    if noise != fitted:
-        raise InputError(
-            f"the posterior was fitted with noise = {fitted!r}, the experiment says {noise!r}",
-            where="[model] noise",
-            remedy=f"add --set model.noise={fitted}, or predict with config.toml of the posterior's folder",
-        )
 
 
 def _known_noise(spec: ModelSpec, known: Mapping[str, Any] | None, step: float) -> tuple[Autoregression | None, Any]:

@@ -10,12 +10,13 @@ from jaxtyping import Float
 
 from rfdropo_bayes.cautions import Caution, Code, read_cautions
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.named_columns import CsvColumns
+from rfdropo_bayes.data.named_columns import UNTIMED, CsvColumns
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import Workpiece
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.command_lag import apart
 from rfdropo_bayes.verbs.motion_check import Motion, motion_cautions
 from rfdropo_bayes.verbs.motion_direction import Paths, direction_of
 from rfdropo_bayes.verbs.motion_size import size_of
@@ -41,6 +42,7 @@ def recording_cautions(
         Caution(Code.RECORDING_DOUBTFUL, f"{recording.name}: {note}")
         for recording in recordings
         for note in recording.notes
+        if note != UNTIMED or apart(recording) is None
     ]
     for recording in recordings:
         cautions += _misnamed(recording, robot.marker_names)
@@ -67,7 +69,7 @@ def cautions_of_fit(
 
 
 def cautions_of_audit(model: Model, recordings: Sequence[Trajectory], paths: Sequence[Paths]) -> list[Caution]:
-    """Doubts for an audit, with ``paths`` of the nominal model."""
+    """Doubts for an audit, with ``paths`` of the model that it starts from."""
     return [*_read(model, recordings), *_moved(model, recordings[:1], paths)]
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import commands_of
@@ -193,7 +193,9 @@ def _as_trajectory(rollout: Simulated, model: Model, values: Mapping[str, float]
     noise, seed = model.spec.stated, model.settings.seed
     if noise is not None:
         key = jax.random.fold_in(jax.random.key(seed), index)
-        position = position + _noise(noise, key, source.time, position.shape[1])
+        position = position + np.asarray(
+            draw_noise(key, source.time, position.shape[1], Noise(noise.standard_deviation, noise.correlation_time))
+        )
     settings: dict[str, Any] = {
         "simulator": simulator.description,
         "parameters": {spec.name: values.get(spec.name, spec.nominal) for spec in simulator.parameters},
@@ -220,10 +222,6 @@ def _as_trajectory(rollout: Simulated, model: Model, values: Mapping[str, float]
         ).trusted(),
         Measured(time=source.time, position=position, marker_names=rollout.markers, object_pose=rollout.pose),
     )
-
-
-def _noise(table: NoiseTable, key: PRNGKeyArray, time: Float[np.ndarray, " time"], markers: int) -> np.ndarray:
-    return np.asarray(draw_noise(key, time, markers, Noise(table.standard_deviation, table.correlation_time)))
 
 
 def _table(source: Trajectory, simulated: Trajectory) -> pd.DataFrame:

@@ -7,8 +7,9 @@ from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.verbs.command_lag import apart
 
-LAGGING = 0.01  # share of its way by which a body may stay behind its commands and count as slow
+LAGGING = 0.02  # share of its way by which a body may stay behind its commands and count as slow
 SETTLED = 10.0  # times a body's slowest period and its damping's time after which it has come to rest
 
 
@@ -29,7 +30,8 @@ def first_period(robot: Robot) -> float:
 def slow_motion(robot: Robot, recording: Trajectory) -> str | None:
     """Why a body that is at rest in every row will do, in words; None if it may not.
 
-    Either rows are so far apart that it has come to rest in each, or its commands change so slowly that it keeps up.
+    Either rows are so far apart that it has come to rest in each, or each shows a pose of its own, or its commands
+    change so slowly that it keeps up.
     """
     period, damping = first_period(robot), robot.nominal()["rayleigh_stiffness"]
     if len(recording.time) < 2:
@@ -37,6 +39,8 @@ def slow_motion(robot: Robot, recording: Trajectory) -> str | None:
     interval = float(np.median(np.diff(recording.time)))
     if interval > SETTLED * max(period, damping):
         return f"rows are {interval:.3g} s apart, and the body comes to rest within a few periods of {period:.2g} s"
+    if (words := apart(recording)) is not None:
+        return f"the body comes to rest in each row: {words}"
     rate = command_rate(recording)
     if rate is not None and rate * damping + (rate * period / (2.0 * np.pi)) ** 2 < LAGGING:
         return (

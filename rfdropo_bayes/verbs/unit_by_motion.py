@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.verbs.column_units import Unit
+from rfdropo_bayes.verbs.column_units import ANGLES, METRIC, Unit
 from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, Size
 
 MOST_TURN = np.pi  # largest turn of a body [rad] by its cables
@@ -29,7 +29,7 @@ def driven_motion(
     `MOST_TURN`.
     """
     place = np.linspace(min(cable.anchor_z_m for cable in robot.cables), max(heights), STEPS)
-    pull = _pulls(robot, command)
+    pull = command @ np.asarray(robot.channel_matrix(robot.nominal()), dtype=float).T
     if np.linalg.norm(_turns(robot, pull, place), axis=2).max() > MOST_TURN:
         return None
     turn = _turns(robot, np.clip(pull, *np.array(robot.drive_limits()).T), place)
@@ -55,11 +55,6 @@ def _turns(
         turn += share[:, None, None] * (whole - reached)
         below, reached = float(end), whole
     return turn
-
-
-def _pulls(robot: Robot, command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row cable"]:
-    """Commanded pull of each cable [m]."""
-    return command @ np.asarray(robot.channel_matrix(robot.nominal()), dtype=float).T
 
 
 def spread(position: Float[np.ndarray, "row marker axis"]) -> float:
@@ -94,7 +89,8 @@ def unit_of_motion(
     if measured == 0.0:
         return guessed
     for name, (other, own) in COMMAND_UNITS.items():
-        driven = driven_motion(robot, own * command, list(heights.values())) if other == kind else None
+        tried = other == kind and name in (*METRIC, *ANGLES, guessed.unit)
+        driven = driven_motion(robot, own * command, list(heights.values())) if tried else None
         if driven is not None:
             moved[name] = Size(measured, spread(driven))
     explaining = [name for name in moved if moved[name].within(EXPLAINED)]

@@ -20,8 +20,9 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
-from rfdropo_bayes.data import CsvColumns, Measured, Origin, SentCommands, Trajectory, read_plain_csv
+from rfdropo_bayes.data import CsvColumns, Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.data.held_readings import hold_time
+from rfdropo_bayes.data.mapped_formats import read_mapped
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.mechanisms.registry import REGISTRY, mechanisms_named
@@ -152,7 +153,7 @@ def test_a_table_of_columns_is_searched_for_held_angles_too(tmp_path):
     np.savetxt(tmp_path / "r.csv", table, "%.9g", delimiter=",", header="t,a,b,x,y,z,phi_a,phi_b", comments="")
     columns = {"time": "t", "commands": ["a", "b"], "command_unit": "rad", "positions": [["x", "y", "z"]]}
     columns |= {"position_unit": "m", "axes": ["x", "y", "z"], "motor_angles": ["phi_a", "phi_b"], "robot": "r"}
-    read = read_plain_csv(tmp_path / "r.csv", CsvColumns.model_validate(columns))
+    read = read_mapped("csv", tmp_path / "r.csv", CsvColumns.model_validate(columns))
     np.testing.assert_array_equal(read.motor_angle_mask, whole.motor_angle_mask)
 
 

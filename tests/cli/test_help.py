@@ -48,9 +48,6 @@ def test_every_option_is_described_and_none_shows_a_type_of_python(name):
         assert shown[1].strip() not in ("", "[required]")
 
 
-@pytest.mark.parametrize(
-    ("command", "option", "unit"), [("adapt", "seconds", "seconds"), ("doctor", "seconds", "seconds")]
-)
-def test_an_option_of_time_names_its_unit(command, option, unit):
-    (found,) = (each for each in COMMANDS[f"rfdropo {command}"].params if each.name == option)
-    assert unit in found.help
+def test_an_option_of_time_names_its_unit():
+    (found,) = (each for each in COMMANDS["rfdropo adapt"].params if each.name == "seconds")
+    assert "seconds" in found.help

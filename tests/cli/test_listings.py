@@ -46,6 +46,6 @@ def test_a_robot_says_what_it_is(monkeypatch, capsys):
 
 
 def test_a_mechanism_says_its_cause_and_the_parameters_of_a_robot(monkeypatch, capsys):
-    text = told(monkeypatch, capsys, "mechanisms", "cable_gain", "--robot", "asl_trunk")
+    text = told(monkeypatch, capsys, "mechanisms", "cable_gain")
     assert REGISTRY["cable_gain"].cause in text
-    assert all(f"cable_gain_error_{channel}" in text for channel in Robot.load("asl_trunk").channel_names)
+    assert all(f"cable_gain_error_{channel}" in text for channel in Robot.load("smooth_arm").channel_names)

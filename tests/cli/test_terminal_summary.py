@@ -21,7 +21,7 @@ def test_an_audit_is_shown_as_it_is(capsys):
     finding = {"mechanism": "play", "parameters": {"play@[red]": ROW}}
     found = {"verdict": "explained", "sentence": WORDS, "findings": [finding], "next_experiment": {"sentence": WORDS}}
     cautions = [{"code": "recording_doubtful", "sentence": WORDS, "grave": False}]
-    show_audit({**found, "adopted": ["play"], "cautions": cautions}, FOLDER, as_json=False)
+    show_audit({**found, "adopted": ["play"], "cautions": cautions}, FOLDER)
     shown = capsys.readouterr().out
     assert shown.count(WORDS) == 3
     assert shown.count(str(FOLDER)) == 3
@@ -39,7 +39,7 @@ def test_a_calibration_is_shown_as_it_is(capsys):
     }
     caution = SimpleNamespace(sentence=WORDS, grave=True)
     found = SimpleNamespace(content=content, folder=FOLDER, verdict="safe", sentence="", cautions=[caution])
-    show_calibration(found, Path("a.toml"), as_json=False)
+    show_calibration(found, Path("a.toml"))
     shown = capsys.readouterr().out
     assert shown.count(WORDS) == 2
     assert shown.count(str(FOLDER)) == 3  # the rest of the parameters, what to run next, the report
@@ -53,13 +53,13 @@ def test_a_calibration_is_shown_as_it_is(capsys):
 def test_a_calibration_says_what_to_type_next(capsys, verdict, words):
     content = {"headline": [], "details": {}, "parameters": {"modulus": ROW}, "method": "laplace"}
     found = SimpleNamespace(content=content, folder=Path("fit"), verdict=verdict, sentence="", cautions=[])
-    show_calibration(found, Path("own arm.toml"), as_json=False)
+    show_calibration(found, Path("own arm.toml"))
     assert f"\nnext: rfdropo {words}\n" in capsys.readouterr().out
 
 
 def test_an_audit_that_adopts_nothing_has_no_model_to_fit(capsys):
     found = {"verdict": "unexplained", "sentence": "", "findings": [], "adopted": [], "cautions": []}
-    show_audit({**found, "next_experiment": {"sentence": ""}}, FOLDER, as_json=False)
+    show_audit({**found, "next_experiment": {"sentence": ""}}, FOLDER)
     assert "then:" not in capsys.readouterr().out
 
 
@@ -70,7 +70,7 @@ def test_a_bar_shows_its_title_as_it_is(capsys):
 
 
 def test_a_prediction_says_what_it_does_before_it_has_done_it(tmp_path, monkeypatch):
-    """Unless the result is to be JSON; what it says is no part of the result."""
+    """What it says is no part of the result."""
     (tmp_path / "posterior.nc").touch()
     monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.see_calibration", lambda *_: None)
     monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.look_through", lambda *_: None)
@@ -82,4 +82,3 @@ def test_a_prediction_says_what_it_does_before_it_has_done_it(tmp_path, monkeypa
     spoken = CliRunner().invoke(app, asked)
     assert spoken.stderr == f"predicting next.csv with draws of {tmp_path}\n"
     assert spoken.stdout == ""
-    assert CliRunner().invoke(app, [*asked, "--json"]).stderr == ""

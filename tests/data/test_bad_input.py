@@ -14,10 +14,10 @@ from rfdropo_bayes.data import (
     load_recordings,
     read_asl_csv,
     read_optitrack_csv,
-    read_plain_csv,
     read_sofa_csv,
 )
 from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.mapped_formats import read_mapped
 from rfdropo_bayes.errors import InputError
 
 
@@ -82,7 +82,7 @@ def test_missing_and_renamed_columns(optitrack_table, write, tmp_path):
     (tmp_path / "own.csv").write_text("t,x,y,z,pull\n0,1,2,3,4\n1,1,2,3,4\n")
     columns = CsvColumns.model_validate(COLUMNS | {"commands": ["pul"]})
     with fails(r"column 'pul' is missing; did you mean 'pull'\?; correct its name in \[data.columns\]"):
-        read_plain_csv(tmp_path / "own.csv", columns)
+        read_mapped("csv", tmp_path / "own.csv", columns)
     (tmp_path / "c.csv").write_text("a,a\n1,2\n")
     with fails("column 'a' appears twice"):
         CsvTable(tmp_path / "c.csv", ["a"])
@@ -165,9 +165,9 @@ COLUMNS = {
 def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
     (tmp_path / "own.csv").write_text("x,y,z,pull\n100,0,0,1\n100,1,0,2\n")
     with fails("column 'u' is missing; nothing else there looks like it: x, y, z, pull"):
-        read_plain_csv(tmp_path / "own.csv", CsvColumns.model_validate(COLUMNS))
+        read_mapped("csv", tmp_path / "own.csv", CsvColumns.model_validate(COLUMNS))
     with fails(r"column 'X' is missing \(and 'Y'\); did you mean 'x'\?"):
-        read_plain_csv(tmp_path / "own.csv", CsvColumns.model_validate(COLUMNS | {"positions": [["X", "Y", "z"]]}))
+        read_mapped("csv", tmp_path / "own.csv", CsvColumns.model_validate(COLUMNS | {"positions": [["X", "Y", "z"]]}))
 
 
 @pytest.mark.parametrize(
@@ -184,7 +184,7 @@ def test_a_plain_csv_needs_the_columns_its_mapping_names(tmp_path):
         ({"format": "csv", "columns": COLUMNS | {"tme": "t"}}, "unknown key 'columns.tme'; did you mean 'time'"),
         (
             {"format": "csv", "columns": COLUMNS | {"position_unit": "metre"}},
-            "position_unit = 'metre': Input should be 'm', 'cm' or 'mm'",
+            "position_unit = 'metre': Input should be 'm', 'cm', 'mm' or 'in'",
         ),
         ({"format": "csv", "columns": COLUMNS | {"axes": ["x", "z", "-z"]}}, "x, y and z once each"),
         ({"format": "csv", "columns": COLUMNS | {"time": "t"}}, "either time"),
@@ -204,7 +204,7 @@ def test_a_missing_key_is_named():
 
 def plain(path, text: str, encoding: str = "utf-8", **changes):
     path.write_bytes(text.encode(encoding))
-    return read_plain_csv(path, CsvColumns.model_validate(COLUMNS | changes))
+    return read_mapped("csv", path, CsvColumns.model_validate(COLUMNS | changes))
 
 
 ROWS = "x,y,z,u\n100.5,0,0,1.5\n100,1,0,2\n100,2,0,2\n"
@@ -251,12 +251,28 @@ def test_decimal_commas_between_commas_are_explained(tmp_path):
         plain(tmp_path / "own.csv", "x;y;z;u\n100,5;0;0;1,5\n1.005,5;0;0;1,5\n100;0;0;1\n")
 
 
-def test_lines_above_the_names_of_the_columns_are_named(tmp_path):
-    """Loggers say there when they began; the row below the names is not at fault."""
-    with fails("the names of its 4 columns stand in line 3, below other lines; leave out the lines above them"):
-        plain(tmp_path / "own.csv", "# logger 3.1\n# begun at noon\n" + ROWS)
+@pytest.mark.parametrize(
+    "above",
+    [
+        "# logger 3.1\n# begun at noon\n",
+        "logger 3.1\n\nbegun;at noon\n",
+        "# rate, 100, Hz, nominal\n",  # as many cells as columns
+        "# ",  # in front of the names
+    ],
+)
+def test_lines_above_the_names_of_the_columns_are_left_out(tmp_path, above):
+    """Loggers say there when they began."""
+    found, bare = plain(tmp_path / "own.csv", above + ROWS), plain(tmp_path / "bare.csv", ROWS)
+    np.testing.assert_array_equal(found.position, bare.position)
+    assert found.cable_names == bare.cable_names
+
+
+def test_rows_of_another_width_are_refused(tmp_path):
     with fails("row 0: has 5 values, but the header names 4"):
         plain(tmp_path / "own.csv", "x,y,z,u\n" + ROWS.removeprefix("x,y,z,u\n").replace("\n", ",\n"))
+    longer = "".join(f"{row},0\n" for row in ROWS.splitlines()[1:])
+    with fails("row 3: has 5 values, but the header names 4"):  # a second table below the first
+        plain(tmp_path / "own.csv", ROWS + "x,y,z,u,v\n" + longer)
 
 
 def test_a_clock_that_is_written_in_no_known_way_is_not_one_cell_to_correct(tmp_path):
@@ -278,8 +294,8 @@ def test_a_folder_is_no_recording(tmp_path):
     spec = DataSpec.parse({"format": "csv", "fit": ["monday"], "columns": COLUMNS})
     with fails(r'monday: is a folder, not a file; name its files, e.g. "monday/\*.csv"'):
         load_recordings(spec, tmp_path)
-    with fails("is a folder, not a file"):
-        read_plain_csv(tmp_path / "monday", CsvColumns.model_validate(COLUMNS))
+    with fails("is a folder, but neither a ROS 2 bag nor a LeRobotDataset"):
+        read_mapped("csv", tmp_path / "monday", CsvColumns.model_validate(COLUMNS))
 
 
 @pytest.mark.parametrize(

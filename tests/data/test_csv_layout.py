@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import CsvColumns, read_plain_csv
+from rfdropo_bayes.data import CsvColumns
 from rfdropo_bayes.data.csv_layout import dialect_of, units_above, without_names
 from rfdropo_bayes.data.csv_table import CsvTable
+from rfdropo_bayes.data.mapped_formats import read_mapped
 from rfdropo_bayes.errors import InputError
 
 NAMES = ["t", "u", "x", "y", "z"]
@@ -22,7 +23,7 @@ def text(separator: str = ",", decimal: str = ".", head: str | None = None) -> s
 
 def read(path, written: str, **changes):
     path.write_text(written)
-    return read_plain_csv(path, CsvColumns.model_validate(COLUMNS | changes))
+    return read_mapped("csv", path, CsvColumns.model_validate(COLUMNS | changes))
 
 
 def check(found) -> None:
@@ -46,7 +47,7 @@ def test_a_file_without_names_shows_its_first_rows_and_asks_for_names(tmp_path):
         read(tmp_path / "run.csv", text(head=""))
     with pytest.raises(InputError, match="has 5 columns, and names has 4"):
         read(tmp_path / "run.csv", text(head=""), names=NAMES[1:])
-    with pytest.raises(InputError, match="begin in line 3, and no line names them"):
+    with pytest.raises(InputError, match="the first line holds values, not the names of its 5 columns: row 0: 0"):
         read(tmp_path / "run.csv", text(head="# logger 3\n# noon"))
 
 
@@ -94,9 +95,9 @@ def test_columns_have_units_of_their_own(tmp_path):
     np.testing.assert_allclose(found.command[:, 0], [1.5e-2, 2e-2, 2e-2])
     np.testing.assert_allclose(found.position[:, 0], np.array(ROWS)[:, 2:] * [1e-3, 1e-3, 1e-2], atol=1e-12)
     with pytest.raises(InputError, match="no column of commands or positions"):
-        read_plain_csv(tmp_path / "run.csv", parsed(units={"t": "ms"}))
+        read_mapped("csv", tmp_path / "run.csv", parsed(units={"t": "ms"}))
     with pytest.raises(InputError, match="gives 'u' in 'rad', which cannot be brought to 'mm'"):
-        read_plain_csv(tmp_path / "run.csv", parsed(units={"u": "rad"}))
+        read_mapped("csv", tmp_path / "run.csv", parsed(units={"u": "rad"}))
 
 
 def parsed(**changes) -> CsvColumns:

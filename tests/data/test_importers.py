@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import CsvColumns, read_asl_csv, read_optitrack_csv, read_plain_csv, read_sofa_csv
+from rfdropo_bayes.data import CsvColumns, read_asl_csv, read_optitrack_csv, read_sofa_csv
 from rfdropo_bayes.data.actions import cumulative_displacement
+from rfdropo_bayes.data.mapped_formats import read_mapped
 from rfdropo_bayes.errors import InputError
 
 
@@ -158,7 +159,7 @@ MAPPING = {
 
 
 def test_plain_csv_converts_through_its_mapping(plain):
-    recording = read_plain_csv(plain, CsvColumns.model_validate(MAPPING))
+    recording = read_mapped("csv", plain, CsvColumns.model_validate(MAPPING))
     np.testing.assert_allclose(recording.time, 0.02 * np.arange(40), atol=1e-9)
     np.testing.assert_allclose(recording.position[10, 0], [0.11, 0.03, 0.2], atol=1e-4)
     np.testing.assert_allclose(recording.command_at(recording.time)[:, 0], np.deg2rad(np.arange(40)))
@@ -169,7 +170,7 @@ def test_plain_csv_converts_through_its_mapping(plain):
 
 def test_positions_are_counted_from_a_marker_of_a_base_that_was_moved(plain):
     """A camera that is moved from row to row changes nothing beside the marker of the base."""
-    still = read_plain_csv(plain, CsvColumns.model_validate(MAPPING)).position
+    still = read_mapped("csv", plain, CsvColumns.model_validate(MAPPING)).position
     header, *lines = plain.read_text().splitlines()
     away = np.random.default_rng(0).normal(scale=100.0, size=(len(lines), 3))
     moved = [f"{header},base_x,base_y,base_z"]
@@ -179,13 +180,13 @@ def test_positions_are_counted_from_a_marker_of_a_base_that_was_moved(plain):
         moved.append(",".join([time, *(f"{value:.9f}" for value in place), *rest[3:], *(f"{b:.9f}" for b in base)]))
     plain.write_text("\n".join(moved))
     beside = CsvColumns.model_validate(MAPPING | {"base_marker": ["base_x", "base_y", "base_z"]})
-    np.testing.assert_allclose(read_plain_csv(plain, beside).position, still, atol=1e-10)
+    np.testing.assert_allclose(read_mapped("csv", plain, beside).position, still, atol=1e-10)
 
 
 def test_the_origin_of_the_base_is_taken_off_in_the_frame_and_unit_of_the_file(plain):
     """The base is 100, 20 and -30 mm along the file's axes, which the base frame calls x, -z and y."""
-    read = read_plain_csv(plain, CsvColumns.model_validate(MAPPING))
-    moved = read_plain_csv(plain, CsvColumns.model_validate(MAPPING | {"origin": [100.0, 20.0, -30.0]}))
+    read = read_mapped("csv", plain, CsvColumns.model_validate(MAPPING))
+    moved = read_mapped("csv", plain, CsvColumns.model_validate(MAPPING | {"origin": [100.0, 20.0, -30.0]}))
     shift = np.broadcast_to([0.1, -0.03, -0.02], read.position.shape)
     np.testing.assert_allclose(read.position - moved.position, shift, atol=1e-12)
 
@@ -194,14 +195,14 @@ def test_counts_are_angles_by_the_counts_of_one_turn(plain):
     """Commands and measured angles alike; the largest command that is believed is in counts, too."""
     counted = MAPPING | {"command_unit": "counts", "counts_per_turn": 360.0}
     counted |= {"motor_angles": ["motor"], "motor_angle_unit": "counts"}
-    read = read_plain_csv(plain, CsvColumns.model_validate(counted))
+    read = read_mapped("csv", plain, CsvColumns.model_validate(counted))
     assert read.command_unit == "rad"
     np.testing.assert_allclose(read.command_at(read.time)[:, 0], np.deg2rad(np.arange(40)))
     np.testing.assert_allclose(read.motor_angle[:, 0], np.deg2rad(np.arange(40)))
     winch = counted | {"counts_per_turn": 4.0}
     with pytest.raises(InputError, match="largest_command"):
-        read_plain_csv(plain, CsvColumns.model_validate(winch))
-    far = read_plain_csv(plain, CsvColumns.model_validate(winch | {"largest_command": 40.0}))
+        read_mapped("csv", plain, CsvColumns.model_validate(winch))
+    far = read_mapped("csv", plain, CsvColumns.model_validate(winch | {"largest_command": 40.0}))
     np.testing.assert_allclose(far.command.max(), 0.5 * np.pi * 39)
 
 
@@ -213,11 +214,11 @@ def test_counts_and_the_counts_of_a_turn_belong_together(change):
 
 def test_plain_csv_takes_commands_from_a_file_of_their_own(plain, tmp_path):
     (tmp_path / "commands.csv").write_text("motor\n" + "\n".join(["7"] * 39))
-    recording = read_plain_csv(plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
+    recording = read_mapped("csv", plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
     np.testing.assert_allclose(recording.command, np.deg2rad(7.0))
     (tmp_path / "commands.csv").write_text("motor\n" + "\n".join(["7"] * 38))
     with pytest.raises(InputError, match="40 observations do not fit 38 commands"):
-        read_plain_csv(plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
+        read_mapped("csv", plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
 
 
 def test_plain_csv_turns_the_object_with_the_frame(tmp_path):
@@ -235,10 +236,10 @@ def test_plain_csv_turns_the_object_with_the_frame(tmp_path):
             "object_pose": ["ox", "oy", "oz", "qx", "qy", "qz", "qw"],
         }
     )
-    pose = read_plain_csv(tmp_path / "object.csv", columns).object_pose
+    pose = read_mapped("csv", tmp_path / "object.csv", columns).object_pose
     np.testing.assert_allclose(pose[0, :3], [0.0, 0.0, -0.5e-3], atol=1e-12)
     moved = CsvColumns.model_validate(columns.model_dump() | {"origin": [10.0, 0.0, 0.0]})
-    shifted = read_plain_csv(tmp_path / "object.csv", moved).object_pose
+    shifted = read_mapped("csv", tmp_path / "object.csv", moved).object_pose
     np.testing.assert_allclose(shifted, pose - [0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
     # a cube turned by 90 degrees about the file's y: its x axis points to -z there, which is -y in the base frame
     x, y, z, w = pose[0, 3:]

@@ -8,9 +8,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults, read_plain_csv
+from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults
 from rfdropo_bayes.data.held_readings import hold_time
-from rfdropo_bayes.data.sample_times import check_times, clock_notes, read_stamps, rounded_notes, sample_time
+from rfdropo_bayes.data.mapped_formats import read_mapped
+from rfdropo_bayes.data.sample_times import (
+    check_times,
+    clock_notes,
+    read_stamps,
+    repeated_rows,
+    rounded_notes,
+    sample_time,
+    spread_repeats,
+)
 from rfdropo_bayes.errors import InputError
 
 STEP = 0.01  # [s]
@@ -57,7 +66,7 @@ def test_dates_and_durations_are_seconds_from_the_first_row(kind, types, tmp_pat
     columns = {"time": "t", **COLUMNS}
     if types == "file":
         frame.to_csv(tmp_path / "run.csv", index=False)
-        found = read_plain_csv(tmp_path / "run.csv", CsvColumns(**columns))
+        found = read_mapped("csv", tmp_path / "run.csv", CsvColumns(**columns))
     else:
         found = Trajectory.from_pandas(frame.set_index("t") if types == "index" else frame, columns)
     np.testing.assert_allclose(found.time, TIME, atol=1e-9)
@@ -73,7 +82,7 @@ def test_whole_numbers_keep_every_digit_in_arrays_and_files(tmp_path):
     ticks = SINCE_1970 + 7 * np.arange(60)
     np.testing.assert_array_equal(np.rint(1e9 * seconds(ticks, "ns")), 7 * np.arange(60))
     table(ticks).to_csv(tmp_path / "run.csv", index=False)
-    found = read_plain_csv(tmp_path / "run.csv", CsvColumns(time="t", time_unit="ns", **COLUMNS))
+    found = read_mapped("csv", tmp_path / "run.csv", CsvColumns(time="t", time_unit="ns", **COLUMNS))
     np.testing.assert_array_equal(np.rint(1e9 * found.time), 7 * np.arange(60))
 
 
@@ -256,3 +265,13 @@ def test_stamps_of_single_precision_are_noted_once_they_are_coarse(kind, tmp_pat
 def test_stamps_of_double_precision_jitter_unsaid():
     stamps = read_stamps(72000.0 + 0.02 * np.arange(200) + np.random.default_rng(0).normal(0.0, 1e-3, 200), where="run")
     assert rounded_notes(stamps, stamps.since(stamps, "run")) == []
+
+
+def test_a_few_repeated_stamps_lie_between_their_neighbours():
+    time = np.arange(60.0)
+    stale = time.copy()
+    stale[[7, 30, 31, 59]] = stale[[6, 29, 29, 58]]
+    np.testing.assert_array_equal(repeated_rows(stale), [7, 30, 31, 59])
+    np.testing.assert_allclose(spread_repeats(stale), time)
+    for refused in (time[::-1], grouped(5), np.r_[time, 3.0]):
+        np.testing.assert_array_equal(spread_repeats(refused), refused)

@@ -27,9 +27,7 @@ ROBOT = "motor_arm"
 
 # A loaded machine without real-time scheduling is no robot: tests ask what happens, not how punctually.
 SEEN_LATE = SensorTable(stale_s=1.0, lost_s=1.0)  # a busy machine delivers frames late
-PATIENT = SafetyTable(
-    settle_s=0.1, misses=50, stale_cycles=30, heartbeat_s=1.0, hold_s=0.2, following_error_m=0.02, start_rate_m_s=0.02
-)
+PATIENT = SafetyTable(settle_s=0.1, misses=50, stale_cycles=30, heartbeat_s=1.0, following_error_m=0.02)
 
 
 class Session(NamedTuple):

@@ -160,6 +160,14 @@ def test_a_data_sheet_of_another_drive_is_refused(rig, tmp_path: Path, old: str,
         rig.drives(eds=str(sheet)).all[0].check(Identity())
 
 
+def test_a_data_sheet_out_of_step_is_used_if_asked(rig, tmp_path: Path) -> None:
+    text = objects.SIMULATED_EDS.read_text()
+    sheet = tmp_path / "other.eds"
+    sheet.write_text(text.replace("ProductNumber=0x52464401", "ProductNumber=0x52464402"))
+    found = rig.drives(eds=str(sheet)).all[0].check(Identity(), check_eds=False)
+    assert found["product"] == 0x52464401
+
+
 def test_no_data_sheet_and_no_answer_are_told_apart(rig, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not a readable data sheet"):
         rig.drives(eds=str(tmp_path / "none.eds"))

@@ -47,7 +47,7 @@ def test_handlers_are_given_back() -> None:
 def test_a_button_and_a_wire_that_came_off(tmp_path: Path) -> None:
     pin = tmp_path / "value"
     pin.write_text("1\n")
-    hook = file_hook(pin, "0")
+    hook = file_hook(pin)
     assert not hook()
     pin.write_text("0\n")
     assert hook()

@@ -202,7 +202,7 @@ def test_homing_finds_the_tension_and_keeps_it(tmp_path: Path) -> None:
         settings = Deployment(robot="motor_arm", bus=found, homing=homing, drives=SLOW, safety=PATIENT)
         outcome = deploy(settings, "home", tmp_path / "s", sensor=sensor)
         assert outcome.cause is Cause.FINISHED, outcome.detail
-    result = load_homing(tmp_path / "home.json", robot, 1.0)
+    result = load_homing(tmp_path / "home.json", robot)
     # A median of five readings and the plant's delay, at 10 mm/s: 0.6 mm
     for motor, home in zip(robot.motors, result.homes, strict=True):
         assert home.offset_counts == pytest.approx(4711, abs=0.6e-3 * motor.counts_per_metre)
@@ -235,10 +235,10 @@ def test_a_homing_that_does_not_hold_is_refused(robot: Robot, tmp_path: Path, ch
     result = HomingResult(robot=robot.name, date=datetime.datetime.now(datetime.UTC), homes=homes)
     path = tmp_path / "home.json"
     result.save(path)
-    load_homing(path, robot, 1.0)
+    load_homing(path, robot)
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(InputError, match=message):
-        load_homing(path, robot, 1.0)
+        load_homing(path, robot)
 
 
 @pytest.mark.slow

@@ -30,7 +30,7 @@ EPOS4_VELOCITY = 0x00B44700  # its 0x60A9: rpm
 MRPM = 0xFDB44700
 TORQUE = 12_000  # [uN m]: of the motors of motor_arm
 # A loaded machine without real-time scheduling is no robot: these tests ask what happens, not how punctually.
-PATIENT = SafetyTable(misses=50, stale_cycles=30, heartbeat_s=1.0, hold_s=0.2, following_error_m=0.02)
+PATIENT = SafetyTable(misses=50, stale_cycles=30, heartbeat_s=1.0, following_error_m=0.02)
 Write = Callable[..., str]
 
 

@@ -73,8 +73,8 @@ def test_a_step_of_a_model_that_is_far_off_brings_nats_by_rows_that_count(far):
 def test_an_audit_ends_under_the_measurements_noise_where_the_extended_model_is_right(far):
     asked, *_ = far
     answer = audit(replace(asked, rules=replace(asked.rules, bootstraps=199)))
-    assert [step.name for step in answer.causes.steps] == ["play"]
-    assert answer.causes.steps[0].fit_target.known is None
+    assert [step.name for step in answer.steps] == ["play"]
+    assert answer.steps[0].fit_target.known is None
     assert answer.verdict == "explained"
     assert answer.target.noise.source == REPEATS
     assert np.mean(answer.extended.residual**2) < 1.2 < POOR < np.mean(answer.base.residual**2)

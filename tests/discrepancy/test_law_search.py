@@ -145,9 +145,9 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert content["ports"]["ports"][0]["adjusted_p"] <= 0.02
     for words in ("no mechanism of the library", "marker m3 x", "u_a u_b", "unseen recordings"):
         assert words in content["sentence"]
-    assert set(law["by_trajectory"]) == set(answer.causes.described.held_out.unseen.names)
-    described = replace(answer.causes.described, holds=False)  # as if unseen recordings did not support it
-    refused = ports_sentence(replace(answer, causes=replace(answer.causes, described=described)))
+    assert set(law["by_trajectory"]) == set(answer.described.held_out.unseen.names)
+    described = replace(answer.described, holds=False)  # as if unseen recordings did not support it
+    refused = ports_sentence(replace(answer, described=described))
     for words in ("a law that unseen recordings do not support", "mm without it", "at marker m3 x", "u_a u_b"):
         assert words in refused
     (table,) = law_tables(answer)
@@ -164,9 +164,9 @@ def test_a_model_that_is_far_off_is_told_no_size_of_a_signal(left, said):
     """There the noise is as large as what is left, and shrinks the signal to half of what it is."""
     row = SimpleNamespace(port=Port("marker tip x", "sensing", "marker", 0, 0, "m", 1e-3, ""), amplitude=0.002)
     found = SimpleNamespace(significant=lambda family: [row])
-    causes = SimpleNamespace(described=SimpleNamespace(holds=False, search=found, last=None))
+    described = SimpleNamespace(holds=False, search=found, last=None)
     problem = SimpleNamespace(rules=SimpleNamespace(family=0.02))
-    answer = SimpleNamespace(causes=causes, problem=problem, extended=SimpleNamespace(residual=np.full(9, left)))
+    answer = SimpleNamespace(described=described, problem=problem, extended=SimpleNamespace(residual=np.full(9, left)))
     assert said in ports_sentence(answer)
     assert ports_sentence(answer).endswith("no law of it holds.")
 
@@ -276,7 +276,7 @@ def test_what_a_term_brings_beside_a_model_is_told_by_rollouts_of_that_model():
     options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
     search = law_search(target, *options)
     given = responses(target, base, question.ports, search.table)
-    values = search._values(given)
+    values = search.table.over(given.levels)
     given = search._sharpened(target, base, given, values, found.ports)
     told = search._ranked(given, values, 0.0)[:3]
     seen = search._beside(LinearModel(target, [], base, given), told)
@@ -324,7 +324,7 @@ def test_a_law_that_follows_the_motion_takes_no_rollouts_for_what_is_measured():
 def test_nothing_is_described_where_nothing_is_hidden():
     answer = audit(asked(101))
     assert answer.verdict == "no_discrepancy"
-    assert answer.causes.described is None
+    assert answer.described is None
 
 
 @pytest.mark.slow

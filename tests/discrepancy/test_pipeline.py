@@ -156,13 +156,9 @@ def on_a_coarse_mesh(asked, error=LARGE, left=0.0):
 def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
     """Once the finer simulator is the model, candidates are refitted, and recordings predicted, with it."""
     answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 0.15}, 102)))
-    assert [step.name for step in answer.causes.steps] == ["discretisation", "play"]
+    assert [step.name for step in answer.steps] == ["discretisation", "play"]
     assert answer.verdict == "explained"
-    assert (
-        answer.causes.steps[1].fit_target.forward
-        is answer.causes.steps[0].fit_target.forward
-        is not answer.target.forward
-    )
+    assert answer.steps[1].fit_target.forward is answer.steps[0].fit_target.forward is not answer.target.forward
     index = answer.problem.coordinates.names.index("play")
     sizes = answer.problem.coordinates.values(answer.draws)[:, index]
     assert abs(sizes.mean() - 0.15) < 4 * sizes.std()
@@ -173,9 +169,9 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, nam
     """Where nothing may be named, an error of the mesh is let pass."""
     asked = on_a_coarse_mesh(problem(TRUTH, 102), error)
     answer = audit(replace(asked, rules=replace(asked.rules, family=family)))
-    assert [step.name for step in answer.causes.steps] == named
+    assert [step.name for step in answer.steps] == named
     assert answer.verdict == ("explained" if named else "no_discrepancy")
-    assert answer.causes.test_series[0].refined is not bool(named)
+    assert answer.test_series[0].refined is not bool(named)
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     if named:  # the finer simulator is the model now
         assert content["numerical_error_mm"] is None
@@ -190,8 +186,8 @@ def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, nam
 def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(left):
     """Also where the finer simulator has half of the error itself, as with time steps of first order."""
     answer = audit(on_a_coarse_mesh(problem(TRUTH, 102), SMALL, left))
-    assert answer.causes.test_series[0].row("discretisation").adjusted_p < 0.02
-    assert answer.causes.steps == []
+    assert answer.test_series[0].row("discretisation").adjusted_p < 0.02
+    assert answer.steps == []
     assert answer.verdict == "no_discrepancy"
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
     assert content["numerical_error_mm"] < content["noise_floor_mm"]
@@ -201,7 +197,7 @@ def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(l
 @pytest.mark.slow
 def test_beside_an_error_of_the_mesh_below_the_noise_causes_are_named():
     answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 1.0}, 102), SMALL))
-    assert [step.name for step in answer.causes.steps] == ["play"]
+    assert [step.name for step in answer.steps] == ["play"]
 
 
 @pytest.mark.slow
@@ -569,7 +565,7 @@ def test_without_repeats_the_noise_is_what_the_extended_model_leaves():
     before, _ = base_model(asked, 0)
     assert np.mean(before.noise.scale) > 2.0 * NOISE
     answer = audit(asked)
-    assert [step.name for step in answer.causes.steps] == ["play"]
+    assert [step.name for step in answer.steps] == ["play"]
     assert answer.verdict == "explained"
     np.testing.assert_allclose(answer.target.noise.scale, NOISE, rtol=0.1)
 
@@ -595,7 +591,7 @@ def test_where_nothing_is_wrong_a_stated_noise_is_not_suspected_however_low_the_
     strict = replace(asked, rules=replace(asked.rules, extended_passes=1.0))
     answer = audit(strict)
     assert answer.verdict == "no_discrepancy"
-    assert answer.doubts.suspected is None
+    assert answer.suspected is None
 
 
 @pytest.mark.slow
@@ -605,7 +601,7 @@ def test_what_predicts_unseen_recordings_worse_is_named_and_not_adopted():
     single = [*fitted.trajectories, *recordings({**TRUTH, "delay": -1.0}, 7)[4:]]
     answer = audit(asked_of(fitted, single, 2))
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
-    assert answer.causes.steps
+    assert answer.steps
     assert answer.adopted == []
     assert answer.verdict == "unexplained"
     assert "predicted worse" in content["sentence"]
@@ -620,7 +616,7 @@ def test_what_only_the_fitted_recordings_have_is_not_adopted_beside_what_all_hav
     single = [*fitted.trajectories, *recordings({**TRUTH, "play": 3.0}, 7)[4:]]
     answer = audit(asked_of(fitted, single, 2))
     content = record(answer, versions={}, data_sha256="", next_experiment=None)
-    assert [step.name for step in answer.causes.steps] == ["play"]
+    assert [step.name for step in answer.steps] == ["play"]
     assert [step.name for step in answer.adopted] == ["play"]
     assert content["unsupported"][0] in ("delay", "lag")
     assert "unseen recordings do not support: not adopted" in content["sentence"]
@@ -739,7 +735,7 @@ def test_a_verdict_agrees_with_the_errors(changes, worse, clear):
 def test_the_recording_that_speaks_against_an_extension_is_named(groups):
     """Groups are to be compared where they have not been."""
     gain = replace(GAIN, elpd_p=None, differences=OPPOSED)
-    said = {"validation": SimpleNamespace(gain=gain), "causes": SimpleNamespace(unsupported=[])}
+    said = {"validation": SimpleNamespace(gain=gain), "unsupported": []}
     answer = SimpleNamespace(adopted=[], problem=SimpleNamespace(compared=groups), **said)
     assert _adoption(answer).startswith(" b is clearly less likely with this (2e+03 mm without, 2.1e+03 mm with it)")
     assert ("otherwise in b: compare groups of recordings with --between" in _doubt(answer)) == (groups is None)

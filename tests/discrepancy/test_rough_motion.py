@@ -76,6 +76,6 @@ def test_a_model_that_cannot_simulate_unseen_recordings_is_not_supported(monkeyp
 
     monkeypatch.setattr(held_out, "_predict", stops)
     answer = audit(asked, report=lines.append)
-    assert (answer.causes.unsupported, answer.causes.steps) == (["play"], [])
+    assert (answer.unsupported, answer.steps) == (["play"], [])
     assert said(answer)["verdict"] in ("unexplained", "described")
     assert any("with play, an unseen recording cannot be simulated" in line for line in lines)

@@ -26,11 +26,10 @@ def answer() -> Answer:
     """Play, then creep, both adopted; the first of them given the lesser share, and a joint test that is not passed."""
     found = audit(problem({"gain": 1.3, "bend": -0.4, "play": 1.0, "creep": 0.6, "creep_time": 0.6}, 4))
     assert len(found.adopted) == 2
-    *before, last = found.causes.test_series
+    *before, last = found.test_series
     test_series = [*before, replace(last, omnibus=replace(last.omnibus, p=0.005))]
     validation = replace(found.validation, stages=[-0.01, 0.98])
-    causes = replace(found.causes, test_series=test_series)
-    return replace(found, verdict="partly_explained", causes=causes, validation=validation)
+    return replace(found, verdict="partly_explained", test_series=test_series, validation=validation)
 
 
 def said(answer: Answer) -> str:
@@ -66,7 +65,7 @@ def test_the_page_shows_the_markers_that_all_recordings_have(answer):
 
 
 def test_the_next_step_is_about_the_largest_share(answer):
-    first, second = (step.name for step in answer.causes.steps)
+    first, second = (step.name for step in answer.steps)
     following = next_experiment(answer)
     assert following["separates"] == [second]
     assert following["sentence"] == f"Check {second} on the robot, 99 % of what is wrong: a remedy."
@@ -98,7 +97,7 @@ def test_a_prior_that_leaves_the_truth_out_is_said_beside_what_is_found(high, de
     """The truth bends by 0.4, where the prior ends at 0.2: a size that goes with it is no measurement."""
     narrow = {"distribution": "Uniform", "low": -high, "high": high}
     found = audit(with_prior(problem({"gain": 1.3, "bend": -0.4, "play": 1.0}, 4), BASE[1].name, narrow))
-    assert found.causes.steps
+    assert found.steps
     content = record(found, versions={}, data_sha256="", next_experiment=None)
     about = [row for row in content["cautions"] if row["code"] == "at_bound"]
     assert bool(about) == decides

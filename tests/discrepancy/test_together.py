@@ -30,9 +30,9 @@ def opposed():
 def test_two_effects_that_pay_only_together_are_named_together(opposed):
     lines: list[str] = []
     answer = audit(opposed, lines.append)
-    assert {step.name for step in answer.causes.steps} == {"stretch", "slack"}
+    assert {step.name for step in answer.steps} == {"stretch", "slack"}
     assert any(line.startswith("refit with slack and stretch: ") for line in lines)
-    alone, beside = (step.log_bayes_factor for step in answer.causes.steps)
+    alone, beside = (step.log_bayes_factor for step in answer.steps)
     assert alone < opposed.rules.evidence < 30.0 < beside
     assert answer.verdict == "explained"
     values = opposed.coordinates.values(answer.draws)
@@ -44,7 +44,7 @@ def test_two_effects_that_pay_only_together_are_named_together(opposed):
 @pytest.mark.slow
 def test_without_pairs_neither_of_the_two_is_named(opposed, monkeypatch):
     monkeypatch.setattr(naming, "paying_pair", lambda *given: [])
-    assert audit(opposed).causes.steps == []
+    assert audit(opposed).steps == []
 
 
 @pytest.mark.slow

@@ -16,6 +16,7 @@ from rfdropo_bayes.fem.native.rod_engine import NativeRod
 from rfdropo_bayes.fem.native.rod_session import RodSession
 from rfdropo_bayes.fem.pushing import PushGeometry, push_scene, rod_spheres
 from rfdropo_bayes.fem.rigid_body import Cube, cube_at
+from tests.fem.energies import energies
 
 TIME_STEP, GRAVITY, LENGTH, SIDE, PLATE, DISTANCE = 0.01, 9.81, 0.12, 0.03, -0.055, 0.005
 REST = PLATE + DISTANCE + SIDE / 2
@@ -184,9 +185,9 @@ def test_energy_is_not_gained():
 
         def one(state, _):
             state = fem.step(system, prepared, state, free, TIME_STEP, integrator="sdirk2")[0]
-            return state, sum(fem.energies(system, prepared, state))
+            return state, sum(energies(system, prepared, state))
 
-        first = sum(fem.energies(system, prepared, start))
+        first = sum(energies(system, prepared, start))
         return first, jax.lax.scan(one, start, None, length=150)[1]
 
     first, later = energy()

@@ -248,6 +248,17 @@ def test_friction_of_rows_at_rest_keeps_its_path():
     assert np.mean(found.solves) / len(way) <= 6.0
 
 
+def test_a_row_at_rest_that_a_jump_leads_astray_is_found_from_the_undeformed_body():
+    """Two rows of long pulls, each by other cables; Newton's method from the first row misses the second."""
+    way = 12.0 * displacements(105)[:, :2]
+    way[:, 0] = np.roll(way[:, 1], 1, axis=1)
+    material, way = rows_of(materials(5), 4), way[4]
+    found = engine("quasi-static").rollout(material, way)
+    assert found.converged.all()
+    alone = engine().rollout(material, np.zeros((1, 3)), start=way[1], steps=0)
+    np.testing.assert_allclose(found.position[0, -1], alone.position[0, 0], rtol=0.0, atol=1e-6)
+
+
 def test_opposed_cables_press_a_bar_together():
     """Four cables through guides at every station, pulled alike to half of the bar's length, under a slight weight to
     the side: the bar stays straight, shorter by what was pulled, and each cable holds a quarter of E A e."""

@@ -9,6 +9,7 @@ import pytest
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.fem.effects import BodyEffects, Wall
+from rfdropo_bayes.fem.native.rod_engine import NativeRod
 
 ELEMENTS, HALF, YOUNG, DENSITY = 16, 0.01, 1e6, 1000.0
 STIFFNESS, AREA = YOUNG * 4.0 * HALF**4 / 3.0, 4.0 * HALF**2
@@ -17,13 +18,25 @@ SYSTEM = fem.System(fem.uniform_rod(1.0, HALF, HALF, ELEMENTS), fem.without_cabl
 END_LOAD = {1.0: (0.30172, 0.05643), 2.0: (0.49346, 0.16064), 5.0: (0.71379, 0.38763), 10.0: (0.81061, 0.55500)}
 # Heavy elastica: w L^3 / E I -> x / L, y / L.
 OWN_WEIGHT = {1.0: (0.99125, 0.12347), 2.0: (0.96689, 0.23851), 5.0: (0.84666, 0.49591), 10.0: (0.65635, 0.70020)}
+# Princeton beam, by load [N]: tip along the section's height and thickness [m], for loads from 0 to 90 degrees between
+# both, every 15. Beam elements of ANSYS in Obrezkov et al. (2022), Nonlinear Dynamics 109, on ANCF beam elements.
+PRINCETON = {
+    8.896: (
+        (0.0107142, 0.0106133, 0.0101117, 0.0088372, 0.0066047, 0.0035389, 0.0),
+        (0.0, 0.0420823, 0.0793948, 0.1089879, 0.1298876, 0.1421944, 0.1462460),
+    ),
+    13.345: (
+        (0.0160642, 0.0164583, 0.0166587, 0.0151862, 0.0115784, 0.0062490, 0.0),
+        (0.0, 0.0643581, 0.1177360, 0.1564672, 0.1818616, 0.1960971, 0.2006777),
+    ),
+}
 # Column above its buckling load (Timoshenko and Gere, Theory of Elastic Stability, table 2-4): P / Pcr -> x / L, y / L.
 COLUMN = {1.152: (0.741, 0.593), 1.293: (0.560, 0.719)}
 
 
 def loads() -> tuple[np.ndarray, np.ndarray]:
     """Wrenches at the tip and gravity of all cases: end loads, own weights, columns, small force, torque, rolled up."""
-    tip, gravity = np.zeros((12, 6)), np.zeros((12, 3))
+    tip, gravity = np.zeros((13, 6)), np.zeros((13, 3))
     for row, load in enumerate(END_LOAD):
         tip[row, 0] = load * STIFFNESS
     for row, load in enumerate(OWN_WEIGHT):
@@ -31,7 +44,7 @@ def loads() -> tuple[np.ndarray, np.ndarray]:
     for row, load in enumerate(COLUMN):
         tip[8 + row, [0, 2]] = 1e-4 * STIFFNESS, -load * STIFFNESS * np.pi**2 / 4.0
     tip[10, [0, 5]] = 1e-4 * STIFFNESS, 1e-3
-    tip[11, 4] = np.pi * STIFFNESS
+    tip[11:, 4] = np.pi * STIFFNESS, 2.0 * np.pi * STIFFNESS
     return tip, gravity
 
 
@@ -87,12 +100,32 @@ def rolled_up(elements: int, turns: float) -> np.ndarray:
 
 
 def test_a_moment_rolls_a_rod_up(settled):
-    """Under the moment of a half turn, the tip is that of an arc; by a whole turn it meets the base as the elements
-    grow short, by their square."""
-    assert settled[1].converged[11]
-    np.testing.assert_allclose(settled[0].position[11, -1], rolled_up(ELEMENTS, 0.5), atol=1e-5)
+    """Under the moments of a half and of a whole turn, the tip is that of an arc; by a whole turn it meets the base as
+    the elements grow short, by their square."""
+    assert np.all(settled[1].converged[11:])
+    assert np.all(settled[1].iterations[11:] <= 40)
+    for row, turns in ((11, 0.5), (12, 1.0)):
+        np.testing.assert_allclose(settled[0].position[row, -1], rolled_up(ELEMENTS, turns), atol=1e-5)
     away = [np.linalg.norm(rolled_up(elements, 1.0)) for elements in (64, 128)]
     assert np.log2(away[0] / away[1]) == pytest.approx(2.0, abs=0.05)
+
+
+def test_a_beam_bends_and_twists_as_the_princeton_beam():
+    """A load at the tip, askew to the axes of the section, bends the beam about both and twists it; 1 % of the way."""
+    system = fem.System(fem.uniform_rod(0.508, 0.5 * 12.3777e-3, 0.5 * 3.2024e-3, 20), fem.without_cables())
+    material = fem.material(system, young_modulus=71.7e9, poisson_ratio=0.31, density=1e-3)
+    mass = material.point_mass.at[-1].set(1.0)
+    angle = np.deg2rad(np.arange(0.0, 91.0, 15.0))
+    way = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    gravity = np.concatenate([load * way for load in PRINCETON])
+    rows = jax.tree.map(lambda part: np.repeat(np.asarray(part)[None], len(gravity), 0), material)
+    rows = rows._replace(gravity=gravity, point_mass=np.tile(mass, (len(gravity), 1)))
+    engine = NativeRod(system, fem.attach(system.body, np.array([[0.0, 0.0, 0.508]])), 0.01, integrator="quasi-static")
+    found = engine.rollout(rows, np.zeros((len(gravity), 1, 0)))
+    expected = np.concatenate([np.transpose(tip) for tip in PRINCETON.values()])
+    assert np.all(found.converged)
+    away = np.linalg.norm(found.position[:, -1, 0, :2] - expected, axis=1)
+    assert np.all(away < 0.01 * np.linalg.norm(expected, axis=1))
 
 
 def one_cable(elements: int) -> fem.System:

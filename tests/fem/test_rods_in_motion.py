@@ -12,6 +12,7 @@ from rfdropo_bayes import fem
 from rfdropo_bayes.fem.cables import threads
 from rfdropo_bayes.fem.dynamics import displaced, momentum, stage_body, twist_of
 from rfdropo_bayes.fem.stage_solve import Way, inertia_times, linearised, matrix_times
+from tests.fem.energies import energies
 
 YOUNG, DENSITY, HALF = 4e5, 1000.0, 0.01
 CABLES = 3
@@ -90,7 +91,7 @@ def march(system, integrator, young, state, time_step, steps, damping, pull):
 
     begin = state._replace(commanded=jnp.zeros(len(system.cables.anchor)))
     end, fine = jax.lax.fori_loop(0, steps, one, (begin, jnp.array(True)))
-    return end, fine, fem.energies(system, prepared, end), momentum(prepared, end, twist_of(end))
+    return end, fine, energies(system, prepared, end), momentum(prepared, end, twist_of(end))
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +128,7 @@ def test_order_in_time(marched, integrator, pull, least, most):
 
 @pytest.mark.slow
 def test_energy_is_kept_with_tiny_steps_and_no_damping(marched):
-    rest = fem.energies(
+    rest = energies(
         trunk(),
         fem.prepare(
             trunk(),

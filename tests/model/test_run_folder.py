@@ -15,7 +15,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError, Interrupted
 from rfdropo_bayes.files import append_line, read_lines, whole, write_text
-from rfdropo_bayes.inference import Checkpoint
+from rfdropo_bayes.inference.progress import Checkpoint
 from rfdropo_bayes.model.experiment import load_experiment
 from rfdropo_bayes.model.experiment_file import look_through, read_tables, self_contained
 from rfdropo_bayes.model.model import Model

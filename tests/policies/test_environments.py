@@ -27,7 +27,16 @@ from rfdropo_bayes.policies.randomisation import (
     read_posterior,
     with_width,
 )
-from rfdropo_bayes.policies.tasks import FLOOR, TASKS, TRACKED_HEIGHTS, layout_of, observed_of, potential, reward
+from rfdropo_bayes.policies.tasks import (
+    FLOOR,
+    MOVING,
+    TASKS,
+    TRACKED_HEIGHTS,
+    layout_of,
+    observed_of,
+    potential,
+    reward,
+)
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.robots import Robot
@@ -72,6 +81,17 @@ def test_reward_is_the_papers() -> None:
     assert potential(np.array([0.0125]))[0] == pytest.approx(p(d))
     assert reward(np.array([0.0125]), np.array([0.06]))[0] == pytest.approx((p(d0) - p(d)) / p(d0) - 0.05)
     assert reward(np.array([0.06]), np.array([0.06]))[0] == pytest.approx(-0.05)
+
+
+def test_movements_of_the_commands_cost_a_part_of_the_reward() -> None:
+    """Commands that alternate cancel in ramps longer than the control period: the distance does not see them."""
+    env = TrunkEnv(REACH, actions="continuous")
+    env.reset(seed=0)
+    first = env.episodes.first.copy()
+    for action in (np.zeros(8), np.linspace(-1.0, 1.0, 8), np.ones(8)):
+        _, gained, _, _, info = env.step(action.astype(np.float32))
+        expected = reward(np.array([info["distance"]]), first)[0] - MOVING * np.mean(action**2)
+        assert gained == pytest.approx(expected, rel=1e-6)
 
 
 def test_observations_have_the_papers_size_and_goals_its_boxes() -> None:

@@ -16,11 +16,11 @@ from rfdropo_bayes.policies.randomisation import Point
 from rfdropo_bayes.policies.tasks import task_named
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
-from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.commands import animated_on_grid
 from rfdropo_bayes.simulators.mechanisms import bodies_of, obstacle
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
+from rfdropo_bayes.simulators.protocol import Result, Simulator
 
 TIME_STEP = 0.01
 SOFA = {"frames": "edges", "masses": "equal", "drives": "sofa", "drive_rate": 1e-3}

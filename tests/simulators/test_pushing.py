@@ -19,10 +19,10 @@ from rfdropo_bayes.model.assembly import backend
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.meshes import read_tetrahedra
-from rfdropo_bayes.simulators import Result, Simulator
 from rfdropo_bayes.simulators.body_engine import Backend, Engine
 from rfdropo_bayes.simulators.cube import push_table
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, TetrahedraTable, assemble_mesh
+from rfdropo_bayes.simulators.protocol import Result, Simulator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
 

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.model.experiment import CommandsTable
+from rfdropo_bayes import fem
+from rfdropo_bayes.fem.effects import BodyEffects
+from rfdropo_bayes.fem.native.rod_engine import NativeRod
+from rfdropo_bayes.model.assembly import build_simulator
+from rfdropo_bayes.model.experiment import CommandsTable, SimulatorTable
+from rfdropo_bayes.model.model_spec import ModelSpec
 from studies.engine_study import TRUTHS
 from studies.hidden_effects import Setting, blank_recordings
-from studies.mujoco_truth import CABLE
+from studies.mujoco_truth import CABLE, CONTROL
 from studies.pyelastica_truth import ElasticaArm
 
 from .test_mujoco_truth import recording_of
@@ -65,3 +71,34 @@ def test_four_equal_pulls_shorten_it_by_what_the_servos_do_not_give():
     give = np.sum(lengths / (VALUES["young_modulus"] * np.asarray(ROBOT.body.axial_area_m2)))
     shorter = pull / (1.0 + 1.0 / (4.0 * CABLE * give))
     np.testing.assert_allclose(tip_under(pull, free), [0.0, 0.0, lengths.sum() - shorter], atol=2e-5)
+
+
+def at_rest(level):
+    """The tip [m] by the package's rod under the same cables, with four elements for each of the robot's own."""
+    settings = SimulatorTable(engine="numba", threads=1, refine=4)
+    assembly = build_simulator(ModelSpec(ROBOT, simulator=settings)).assembly
+    body = assembly.system.body
+    material = fem.material(
+        assembly.system,
+        young_modulus=VALUES["young_modulus"],
+        poisson_ratio=0.0,
+        density=VALUES["trunk_mass"] / np.sum(np.diff(body.station) * body.mass_area),
+        gravity=ROBOT.gravity_m_s2,
+    )
+    material = material._replace(effects=BodyEffects(cable_compliance=1.0 / CABLE))
+    engine = NativeRod(assembly.system, assembly.markers, 0.01, threads=1, integrator="quasi-static")
+    return engine.rollout(jax.tree.map(lambda part: np.asarray(part)[None], material), level[None, None]).position[
+        0, -1
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [(0.012, -0.03, -0.03, -0.03), (0.02, -0.03, -0.03, 0.006)])
+def test_one_and_two_pulls_bend_it_as_the_rod_of_the_package(level):
+    """Within 1 % of the tip's way."""
+    periods = round(1.2 / CONTROL)
+    held = np.array(level) * np.minimum(np.arange(periods) / (0.5 * periods), 1.0)[:, None]
+    tip = ElasticaArm(ROBOT, VALUES, TRUTHS["pyelastica"].effects["payload at the tip"])._path(held, 0.0)[-1, -1]
+    expected = at_rest(np.array(level))[-1]
+    way = np.linalg.norm(expected - [0.0, 0.0, ROBOT.body.station_m[-1]])
+    assert np.linalg.norm(tip - expected) < 0.01 * way

@@ -235,14 +235,14 @@ def test_errors_last_as_long_in_rows_of_another_rate(adapted):
 
 
 def test_the_terminal_shows_the_day_first_and_what_comes_next(adapted, capsys):
-    show_calibration(adapted, as_json=False)
+    show_calibration(adapted)
     lines = capsys.readouterr().out.splitlines()
     header = next(k for k, line in enumerate(lines) if line.startswith("parameter"))
     assert lines[header + 1].startswith("zero_deviation@today")
     assert f"next: rfdropo predict {adapted.folder} --commands FILE --out OUT" in lines
-    facts = {"start_pose_known": True, "rows": 3, "draws": 2, "posterior": "P", "files": ["f"]}
+    facts = {"start_pose_known": True, "rows": 3, "draws": 2, "posterior": "P"}
     facts |= {"group": "today", "group_fitted": True, "cautions": [{"sentence": "1 draws did not converge"}]}
-    show_prediction(facts, as_json=False)
+    show_prediction(facts, [Path("f")])
     assert capsys.readouterr().out.splitlines()[1:3] == ["group today, fitted", "caution: 1 draws did not converge"]
 
 
@@ -359,7 +359,7 @@ def test_lost_markers_are_left_out(known, tmp_path, monkeypatch):
 
 def test_what_was_left_out_is_printed(adapted, capsys):
     recordings = [{**row, "masked": 2} for row in adapted.content["recordings"]]
-    show_calibration(replace(adapted, content={**adapted.content, "recordings": recordings}), as_json=False)
+    show_calibration(replace(adapted, content={**adapted.content, "recordings": recordings}))
     assert "left out: 2 of 26 positions" in capsys.readouterr().out
 
 

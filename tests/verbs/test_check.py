@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -453,6 +453,21 @@ def test_stamps_of_arrival_and_a_clock_that_jumps_are_doubtful(tmp_path):
     assert not arrival.problems
     jump = checked(tmp_path, time=0.05 * ROWS + 600.0 * (ROWS > 29))
     assert any("run: the clock jumps by 600 s before row 30" in note for note in jump.doubts)
+
+
+def test_another_kind_of_motion_that_cannot_be_simulated_is_left_out(monkeypatch):
+    """It is only compared; a failure of the experiment's own motion is a problem."""
+
+    def failing(spec, recording, longest, never="quasi-static"):
+        if spec.simulator.motion == never:
+            raise InputError("the simulation ended: diverged", where="[simulator]")
+        return np.zeros((len(recording.time), 1, 3))
+
+    monkeypatch.setattr(numerical_error, "nominal_markers", failing)
+    assert measure_numerical_error(demo_spec("euler"), demo()).rest is None
+    monkeypatch.setattr(numerical_error, "nominal_markers", partial(failing, never="dynamic"))
+    with pytest.raises(InputError, match="diverged"):
+        measure_numerical_error(demo_spec("euler"), demo())
 
 
 def test_the_numerical_error_of_step_and_mesh_is_said(monkeypatch):

@@ -92,10 +92,16 @@ def test_columns_may_be_in_several_units_of_one_kind():
         (("valve1_bar", "valve2_bar"), "bar"),
         (("p_mbar", "q_mbar"), "mbar"),
         (("pressure_1", "pressure_2"), "bar"),
+        (("F_NE", "F_SW"), "N"),
+        (("tension1", "tension2"), "N"),
+        (("Motor 1 [Grad]", "Motor 2 [Grad]"), "deg"),
+        (("pull_1_in", "pull_2_in"), "in"),
+        (("pull_1 (in)", "pull_2 (in)"), "in"),
+        (("pull_in_1", "pull_in_2"), "mm"),
         (("c1", "c2"), "mm"),
     ],
 )
-def test_percents_volts_and_pressures_are_no_lengths(names, unit):
+def test_units_of_commands_by_their_names(names, unit):
     whole = named(*names)
     assert command_unit(whole, whole.frame, names).unit == unit
 
@@ -107,3 +113,17 @@ def test_lengths_are_in_the_unit_in_which_markers_are_as_far_apart_as_on_the_rob
     assert unit_of_places(start, heights).unit == unit
     assert unit_of_places(size * np.array([[0.0, 0.01, 0.119]]), {"tip": 0.12}).unit == unit
     assert unit_of_places(size * np.array([[0.4, 0.01, 0.119]]), {"tip": 0.12}) is None
+
+
+@pytest.mark.parametrize(
+    ("names", "values", "unit"),
+    [
+        (("enc_A", "enc_B"), [12, -40], "counts"),
+        (("c1", "c2"), [12, 2047], "counts"),
+        (("c1", "c2"), [12, -40], "mm"),
+        (("c1", "c2"), [12.5, 2047.0], "mm"),
+    ],
+)
+def test_large_whole_numbers_and_encoders_are_counts(names, values, unit):
+    whole = CsvTable.of_frame(pd.DataFrame([dict.fromkeys(names, value) for value in values]), "run", ())
+    assert command_unit(whole, whole.frame, names).unit == unit

@@ -16,6 +16,7 @@ from rfdropo_bayes.model.experiment import load_experiment, matching
 from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_names import guess_columns, suggested_names
+from rfdropo_bayes.verbs.init import data_tables, with_counts, with_turns
 
 ROWS = 40
 TIME = 0.05 * np.arange(ROWS)
@@ -76,6 +77,29 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.tensions == [f"tension{k}" for k in range(1, 5)]
     assert guess.motor_angles == [f"motor{k}_meas" for k in range(1, 5)]
     assert guess.unused == ["battery"]
+
+
+def test_counters_that_begin_anew_are_read_on(tmp_path):
+    run = table("t", "{marker}_{axis}", "enc{0}")
+    turns = 3000.0 * np.sin(3.0 * TIME)
+    run["enc1"] = np.round(turns).astype(int) % 4096
+    run["tip_x"] = 0.01 * turns
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = with_turns(with_counts(guess_columns(tmp_path / "run.csv"), 4096.0, unit_given=False))
+    assert guess.unwrap == {"enc1": 4096.0}
+    np.testing.assert_allclose(np.diff(guess.sent[:, 0]), np.diff(turns), atol=1.0)
+    (line,) = (line for line in data_tables(tmp_path, ["low", "tip"], [], [], guess) if line.startswith("unwrap"))
+    assert line.startswith("unwrap = {enc1 = 4096}  # ASSUMED")
+
+
+@pytest.mark.parametrize(("names", "unit"), [("F_{0}", "N"), ("tension{0}", "N"), ("enc{0}_counts", "counts")])
+def test_measured_forces_and_angles_stand_for_commands_that_nobody_recorded(tmp_path, names, unit):
+    run = table("t", "{marker}_{axis}", names)
+    run["battery_V"] = 12.0
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.commands, guess.command_unit) == ([names.format(k) for k in range(1, 5)], unit)
+    assert (guess.tensions, guess.motor_angles) == ([], [])
 
 
 def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(tmp_path):
@@ -319,6 +343,21 @@ def test_a_file_without_names_is_read_by_the_names_that_init_suggests(tmp_path, 
     (read,) = load_recordings(experiment.data, tmp_path / "arm")
     np.testing.assert_allclose(read.command, 1e-3 * run[[f"u{k}" for k in range(1, 5)]])
     assert read.marker_names == ("low", "tip")
+
+
+def test_positions_and_commands_may_be_two_files_without_names(tmp_path, monkeypatch, capsys):
+    run = table("t", "{marker}_{axis}", "u{0}")
+    sent = [name for name in run if name.startswith("u")]
+    run.drop(columns=sent).to_csv(tmp_path / "run.csv", index=False, header=False)
+    run[["t", *sent]].to_csv(tmp_path / "sent.csv", index=False, header=False)
+    monkeypatch.chdir(tmp_path)
+    words = ["--recording", "run.csv", "--commands", "sent.csv", "--length-mm", "200", "--cables", "4"]
+    words += ["--markers", "low=100,tip=200", "--names", ",".join(name for name in run if name not in sent)]
+    status, told = init(monkeypatch, capsys, "arm", *words, "--command-names", ",".join(["t", *sent]))
+    assert status == 0, told
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    (read,) = load_recordings(experiment.data, tmp_path / "arm")
+    np.testing.assert_allclose(read.command, 1e-3 * run[sent])
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,7 @@ from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.budget import FEWEST_DRAWS, FEWEST_ROLLOUTS, MOST_DRAWS, budget_within
 from rfdropo_bayes.verbs.calibrate import _budgeted
-from rfdropo_bayes.verbs.installation import (
-    ORIGIN,
-    ROWS_AT_REST,
-    ZERO,
-    installed_mechanisms,
-    installed_priors,
-    largest_pull,
-    parts_of,
-)
+from rfdropo_bayes.verbs.installation import ORIGIN, ZERO, installed_mechanisms, installed_priors, largest_pull
 
 
 def arm(scale: float = 1.0, unit: str = "rad") -> Robot:
@@ -77,26 +69,6 @@ def test_zeros_without_a_recording_are_lengths_of_cable_whatever_the_unit_of_com
 
 def test_commands_that_never_move_leave_zeros_fixed():
     assert "initial_displacement" not in priors_of(installed_priors(arm(), run("rad", 0.0)))
-
-
-def test_the_last_third_is_kept_for_a_test_unless_there_are_few_rows():
-    assert parts_of(run("rad", 1.0, rows=90), 1, rests=True, timed=True) == [{"rows": [0, 59]}, {"rows": [60, 89]}]
-    assert parts_of(run("rad", 1.0, rows=40), 1, rests=True, timed=True) == []
-    assert parts_of(None, 1, rests=False, timed=True) == []
-
-
-def test_of_many_rows_at_rest_a_fit_takes_some():
-    rows = 12 * ROWS_AT_REST
-    many, last = run("rad", 1.0, rows=rows), rows - 1
-    parts = partial(parts_of, many)
-    assert parts(1, rests=False, timed=True) == [
-        {"rows": [0, 8 * ROWS_AT_REST - 1]},
-        {"rows": [8 * ROWS_AT_REST, last]},
-    ]
-    assert parts(1, rests=True, timed=True)[0] == {"rows": [0, 8 * ROWS_AT_REST - 1], "every": 8}
-    assert parts(1, rests=True, timed=False) == [{"rows": [first, last], "every": 12} for first in (0, 6)]
-    assert parts(3, rests=True, timed=True) == [{"every": 24}, {"every": 24}, {}]
-    assert parts(3, rests=False, timed=True) == []
 
 
 def test_cables_of_an_arm_with_sections_stretch_and_are_turned():

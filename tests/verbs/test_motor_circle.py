@@ -94,7 +94,7 @@ def record(folder: Path, names: dict[str, int], hidden: str = "") -> None:
         "motor_arm", hub, "rfdropo_bayes.verbs.simulated_plant:trunk", settings, True, sensor.address
     )
     # A loaded machine without real-time scheduling is no robot.
-    patient = SafetyTable(settle_s=1.0, misses=50, stale_cycles=30, heartbeat_s=1.0, start_rate_m_s=0.02)
+    patient = SafetyTable(settle_s=1.0, misses=50, stale_cycles=30, heartbeat_s=1.0)
     with simulated_drives(table) as found:
         for name, seed in names.items():
             walk(robot, name, seed).save(folder / f"{name}_commands.nc")

@@ -11,6 +11,7 @@ import pytest
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.faults import NOTES
+from rfdropo_bayes.data.named_columns import UNTIMED
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.results.audited import Audit
@@ -99,3 +100,35 @@ def test_an_answer_without_findings_still_shows_the_doubts(demo):
     bands = SimpleNamespace(values=demo.time), SimpleNamespace(values=demo.marker_names)
     prediction = Prediction({"time": bands[0], "marker": bands[1]}, None, cautions=[caution])
     assert f"demo_1: {SWAPPED}" in repr(prediction)
+
+
+@pytest.mark.parametrize(("pulled", "doubts"), [(0.0, 1), (0.01, 0)])
+def test_a_first_row_far_away_is_doubted_unless_cables_were_pulled(pulled, doubts):
+    robot = Robot.outline(name="arm", length=0.2, radius=0.01, markers={"tip": 0.2}, cables=1)
+    bent = Trajectory.from_arrays(
+        time=[0.0, 1.0],
+        position=np.tile([0.15, 0.0, 0.1], (2, 1, 1)),
+        markers=["tip"],
+        channels=["pull_1"],
+        command=[[pulled], [0.01]],
+        initial_command="first",
+    )
+    found = recording_cautions(robot, [bent])
+    assert sum("off the undeformed robot" in each.sentence for each in found) == doubts
+
+
+@pytest.mark.parametrize(("apart", "doubts"), [(True, 0), (False, 1)])
+def test_rows_without_times_are_doubted_unless_each_is_a_pose_of_its_own(apart, doubts):
+    robot = Robot.outline(name="arm", length=0.2, radius=0.01, markers={"tip": 0.2}, cables=1)
+    pulled = 0.01 * (np.random.default_rng(0).random(60) if apart else np.sin(np.linspace(0.0, 3.0, 60)) ** 2)
+    still = 3e-4 * np.random.default_rng(1).normal(size=60)
+    poses = Trajectory.from_arrays(
+        time=np.arange(60.0),
+        position=np.stack([pulled, still, 0.2 + still], axis=1)[:, None],
+        markers=["tip"],
+        channels=["pull_1"],
+        command=pulled[:, None],
+        command_time=np.arange(60.0) - 0.5,
+        initial_command="first",
+    ).with_attributes(name="poses", settings={NOTES: [UNTIMED]})
+    assert len(recording_cautions(robot, [poses])) == doubts

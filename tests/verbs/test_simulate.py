@@ -56,14 +56,14 @@ recordings = ["walk"]
 
 
 def simulate(experiment: Path, out: Path, monkeypatch, capsys, *overrides: str) -> dict:
-    """The JSON that the command prints."""
+    """The content of the simulation.json that the command writes."""
     options = [part for assignment in overrides for part in ("--set", assignment)]
-    monkeypatch.setattr(sys, "argv", ["rfdropo", "simulate", str(experiment), "--json", "--out", str(out), *options])
+    monkeypatch.setattr(sys, "argv", ["rfdropo", "simulate", str(experiment), "--out", str(out), *options])
     with pytest.raises(SystemExit) as stopped:
         main()
     captured = capsys.readouterr()
     assert not stopped.value.code, captured.err
-    return json.loads(captured.out)
+    return json.loads((out / "simulation.json").read_text())
 
 
 @pytest.fixture

@@ -46,3 +46,17 @@ def test_a_sine_changes_by_its_size_in_its_period_over_two_pi():
 def test_slow_commands_and_rows_far_apart_are_told(time, command, slow):
     found = slow_motion(ARM, recording(time, command(time)))
     assert found is None if slow is None else slow in found
+
+
+def test_rows_that_show_their_own_commands_are_poses_at_rest():
+    """The slowest period is of a body that no cable holds."""
+    pulled, time = 0.01 * np.random.default_rng(0).random(60), 0.05 * np.arange(60)
+    moved = np.stack([pulled, 0.1 * pulled, 0.2 - pulled**2], axis=1)[:, None]
+    given = {"markers": ["tip"], "channels": ["pull_1"], "command_time": time, "initial_command": "first"}
+    poses = rb.Trajectory.from_arrays(time=time, position=moved, command=pulled[:, None], **given)
+    assert "comes to rest in each row" in slow_motion(ARM, poses)
+    lagging = np.convolve(pulled, np.full(5, 0.2), "same")
+    moved = np.stack([lagging, 0.1 * lagging, 0.2 - lagging**2], axis=1)[:, None]
+    assert (
+        slow_motion(ARM, rb.Trajectory.from_arrays(time=time, position=moved, command=pulled[:, None], **given)) is None
+    )

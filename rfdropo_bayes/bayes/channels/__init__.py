@@ -7,17 +7,3 @@ from rfdropo_bayes.bayes.channels.object_pose import ObjectPose
 from rfdropo_bayes.bayes.channels.orientation import Orientation
 from rfdropo_bayes.bayes.channels.tension import Tension
 from rfdropo_bayes.bayes.channels.weighed import Weighed, WeighedParts
-
-__all__ = [
-    "Channel",
-    "FeatureChannel",
-    "Markers",
-    "MotorAngle",
-    "ObjectPose",
-    "Orientation",
-    "Seen",
-    "Series",
-    "Tension",
-    "Weighed",
-    "WeighedParts",
-]

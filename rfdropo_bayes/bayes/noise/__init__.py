@@ -3,9 +3,7 @@
 from rfdropo_bayes.bayes.noise.autoregression import Autoregression
 from rfdropo_bayes.bayes.noise.inferred import (
     LASTING_NOISE,
-    LONG_AGO,
     NOISE_CORRELATION_TIME,
-    NOISE_DEGREES,
     NOISE_MODELS,
     OBSERVATION_NOISE,
     Noise,
@@ -17,21 +15,3 @@ from rfdropo_bayes.bayes.noise.inferred import (
     timeline,
     whiten,
 )
-
-__all__ = [
-    "LASTING_NOISE",
-    "LONG_AGO",
-    "NOISE_CORRELATION_TIME",
-    "NOISE_DEGREES",
-    "NOISE_MODELS",
-    "OBSERVATION_NOISE",
-    "Autoregression",
-    "Noise",
-    "Timeline",
-    "draw_noise",
-    "noise_specs",
-    "noise_values",
-    "row_log_density",
-    "timeline",
-    "whiten",
-]

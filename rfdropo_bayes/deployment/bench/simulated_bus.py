@@ -228,7 +228,7 @@ def run_hub(channel: str) -> None:
 
 
 @contextlib.contextmanager
-def simulated_drives(table: SimulationTable, patience: float = START) -> Iterator[BusTable]:
+def simulated_drives(table: SimulationTable) -> Iterator[BusTable]:
     """The drives in their own process; yields the bus to find them on.
 
     Raises:
@@ -236,7 +236,10 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
     """
     with tempfile.TemporaryDirectory(prefix="rfdropo_") as folder:
         ready, errors = Path(folder) / "ready", Path(folder) / "errors"
-        description = json.dumps(_as_json(table))
+        values = [[index, subindex, value] for (index, subindex), value in table.values.items()]
+        description = json.dumps(
+            table._asdict() | {"bus": table.bus.model_dump(), "values": values, "settings": dict(table.settings)}
+        )
         program = (
             "import sys; from rfdropo_bayes.deployment.bench.simulated_bus import main; main(sys.argv[1], sys.argv[2])"
         )
@@ -244,7 +247,7 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
             command = [sys.executable, "-c", program, description, str(ready)]
             process = subprocess.Popen(command, stderr=sink)
         try:
-            end = time.monotonic() + patience
+            end = time.monotonic() + START
             while not (ready.is_file() and ready.read_text(encoding="utf-8")):
                 if process.poll() is not None or time.monotonic() > end:
                     said = errors.read_text(encoding="utf-8").strip().splitlines() or ["no word"]
@@ -258,11 +261,6 @@ def simulated_drives(table: SimulationTable, patience: float = START) -> Iterato
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-
-
-def _as_json(table: SimulationTable) -> dict[str, Any]:
-    values = [[index, subindex, value] for (index, subindex), value in table.values.items()]
-    return table._asdict() | {"bus": table.bus.model_dump(), "values": values, "settings": dict(table.settings)}
 
 
 def main(description: str, ready: str) -> None:

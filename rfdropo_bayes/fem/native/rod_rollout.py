@@ -17,10 +17,10 @@ from rfdropo_bayes.fem.native.rod_assembly import measure_element
 from rfdropo_bayes.fem.native.rod_constraints import constrained_stage
 from rfdropo_bayes.fem.native.rod_effects import BRANCH, DECAY, EFFECTS, FLAGS, LAW, LOADED, follow_branch
 from rfdropo_bayes.fem.native.rod_records import ELEMENT, Factors, RodSamples, RodWork
-from rfdropo_bayes.fem.native.rod_statics import come_to_rest, keep_found, measure_imbalance, put_at_rest
+from rfdropo_bayes.fem.native.rod_statics import come_to_rest, go_to_rest, keep_found, measure_imbalance, put_at_rest
 from rfdropo_bayes.fem.native.rod_step import predict_stations, set_factors
 from rfdropo_bayes.fem.native.rod_tables import FRAME, INNER, SECTION, SIZE, RodTables
-from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, fill, fma, kernel, load, store, whole
+from rfdropo_bayes.fem.native.simd import addresses, aligned_zeros, any_greater, fill, fma, kernel, load, store, whole
 from rfdropo_bayes.fem.native.slip_rows import kinds_present, start_slip
 from rfdropo_bayes.fem.rod import SHEAR
 
@@ -263,6 +263,7 @@ def settle(tables, runs, batch, samples, factors, work, friction, rows, p, sched
     fill_lanes(batch.start, batch.start_pitch, 0, tables.drives, first, batch.count, work.commanded, token)
     if schedule.static_iterations > 0:
         most, bound = schedule.static_iterations, schedule.at_start
+        store(work.moving, 0, fill(1.0, work.moving, token))
         come_to_rest(tables, runs, samples, factors, work, friction, rows, p, 0, most, bound, schedule, token)
         measure_imbalance(tables, samples, factors, work, token)
         keep_found(tables, work, True, token)
@@ -273,14 +274,21 @@ def settle(tables, runs, batch, samples, factors, work, friction, rows, p, sched
 
 @kernel
 def take_row(tables, runs, batch, samples, factors, work, friction, rows, p, schedule, step, first, token):
-    """One row of a quasi-static motion: the equilibrium at its commands, found from the row before."""
+    """One row of a quasi-static motion: the equilibrium at its commands, found from the row before, or else, without
+    friction, from the undeformed body. A lane without an equilibrium in an earlier row stays: its rollout failed.
+    """
     slips = 0
     if runs is not None:
         slips = kinds_present(samples)[0] * runs.count
     take_loads(batch, samples, work, step + 1, first, token)
     _take_commands(tables, batch, work, step, 1.0, first, token)
     most, bound = ROW_ITERATIONS, schedule.at_rest
+    store(work.moving, 0, fill(1.0, work.moving, token) - load(work.failed, 0, token))
     come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token)
+    if slips == 0:
+        go_to_rest(tables, work, token)
+        if any_greater(load(work.moving, 0, token), fill(0.0, work.moving, token)):
+            come_to_rest(tables, runs, samples, factors, work, friction, rows, p, 0, most, bound, schedule, token)
     keep_found(tables, work, False, token)
 
 

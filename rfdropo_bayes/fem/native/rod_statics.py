@@ -119,7 +119,8 @@ def _choose_way(tables, work, moving, token):
 @kernel
 def _follow_stress(tables, samples, factors, work, share, token):
     """Let the stresses that turn in the matrix go a share of their way to those of the increment in ``velocity``,
-    without its second order: in a thin rod that order of a rotation is a large force along the axis.
+    without its second order: in a thin rod that order of a rotation is a large force along the axis. Moments turn only
+    on a body with cables, see `equilibrium`.
 
     As in Newton's method with independent stresses (Magisano, Leonetti and Garcea 2017, "How to improve efficiency and
     robustness of the Newton method in geometrically non-linear structural problem discretized via displacement-based
@@ -129,7 +130,7 @@ def _follow_stress(tables, samples, factors, work, share, token):
     for element in range(tables.stations - 1):
         measure_element(tables, samples, element, work, token)
         place_stress(tables, samples, factors, element, work, token)
-        for i in range(SIZE):
+        for i in range(SIZE if tables.cables > 0 else 3):
             row, there = SIZE * element + i, load(work.element, STRESS + i, token)
             before = load(work.stress, row, token)
             store(work.stress, row, where_greater(share, zero, fma(share, there - before, before), before))
@@ -204,15 +205,13 @@ def _set_least(tables, samples, work, token):
 
 @kernel
 def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips, most, bound, schedule, token):
-    """Find the equilibrium from the present state in at most ``most`` iterations, to the increment ``bound`` relative
-    to the body's length. A lane without an equilibrium in an earlier row is not moved, and its rollout counts as
-    failed.
+    """Find the equilibrium of the lanes in ``moving`` from their present state in at most ``most`` iterations, to the
+    increment ``bound`` relative to the body's length.
     """
     zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
     _start_settling(tables, samples, factors, work, token)
     clear(work.stress, 0, SIZE * tables.stations, token)
     _follow_stress(tables, samples, factors, work, one, token)
-    store(work.moving, 0, one - load(work.failed, 0, token))
     store(work.largest, 0, fill(UNBOUNDED, work.frame, token))
     store(work.pace, 0, zero)
     store(work.shift, 0, zero)
@@ -226,6 +225,23 @@ def come_to_rest(tables, runs, samples, factors, work, friction, rows, p, slips,
             break
     if runs is not None:
         end_row(friction, slips, token)
+
+
+@kernel
+def go_to_rest(tables, work, token):
+    """Let the lanes without an equilibrium of this row move again, from the undeformed body without tension; the others
+    stay.
+    """
+    zero, one = fill(0.0, work.frame, token), fill(1.0, work.frame, token)
+    clear(work.solution, 0, SIZE * tables.stations, token)
+    lost = one - near(tables, work, zero, False, token)
+    missed = where_greater(load(work.unsolved, 0, token) + load(work.moving, 0, token), zero, one, lost)
+    missed = missed * (one - load(work.failed, 0, token))
+    put_at_rest(tables, one - missed, work, token)
+    for c in range(tables.cables):
+        store(work.tension, c, where_greater(missed, zero, zero, load(work.tension, c, token)))
+    store(work.unsolved, 0, zero)
+    store(work.moving, 0, missed)
 
 
 @kernel

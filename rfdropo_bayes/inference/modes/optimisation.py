@@ -155,13 +155,13 @@ def step(target: Optimisable, state: LevenbergState, tolerance: float) -> tuple[
     return moved, OptimisationStep(gain, promised)
 
 
-def with_fitting_noise(target: Optimisable, u: Float[np.ndarray, " d"], width: float = 12.0) -> np.ndarray:
+def with_fitting_noise(target: Optimisable, u: Float[np.ndarray, " d"]) -> np.ndarray:
     """The point with its noise coordinates, one after the other, at the best of a wide grid.
 
     A start drawn from the prior, or the optimum of a shorter horizon, may have a noise that makes its residuals look
     impossible; every step then answers to the few rows that are hardest to fit.
     """
-    steps = np.linspace(-0.5 * width, 0.5 * width, NOISE_GRID)
+    steps = np.linspace(-6.0, 6.0, NOISE_GRID)
     for coordinate in np.flatnonzero(target.noise):
         points = np.tile(u, (len(steps), 1))
         points[:, coordinate] += steps

@@ -200,12 +200,12 @@ def _works(transform: Callable, residuals: Callable, u: np.ndarray) -> bool:
     return True
 
 
-def _noise_coordinates(determinant: Callable, u: np.ndarray, width: float = 0.05) -> np.ndarray:
+def _noise_coordinates(determinant: Callable, u: np.ndarray) -> np.ndarray:
     """Coordinates along which the log determinant ``c`` changes.
 
     It is the log likelihood plus ``r'r / 2`` of the SAME rollouts, whose errors cancel, single precision included.
     """
-    steps = width * np.eye(len(u))
+    steps = 0.05 * np.eye(len(u))
     values = determinant(np.concatenate([u[None], u + steps, u - steps]))
     changes = np.abs(values[1:] - values[0]).reshape(2, len(u))
     # The other side of a failed rollout still gives a difference.
@@ -224,11 +224,12 @@ def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarra
     return (upper - lower) / (2.0 * DIFFERENCE)
 
 
-def _noise_hessian(likelihood: Callable, u: np.ndarray, noise: np.ndarray, width: float = 1e-2) -> np.ndarray:
+def _noise_hessian(likelihood: Callable, u: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Second differences of the log likelihood along the noise coordinates.
 
     The width is large for a difference because the log likelihood itself is: 1e5 nats leave 1e-11, over 1e-4.
     """
+    width = 1e-2
     steps = width * np.eye(len(u))[noise]
     k = len(steps)
     points = [u + si * a + sj * b for a in steps for b in steps for si in (1, -1) for sj in (1, -1)]

@@ -32,6 +32,8 @@ from rfdropo_bayes.inference.smc.moves import host_generator
 
 OPTIMISERS = ("cma", "cem")
 STEP = 0.3  # initial step of an optimiser, as a share of the search range
+ELITE = 0.3  # share of the candidates that a refit by cross-entropy uses
+SMOOTHING = 0.7  # weight of the new fit; the old fit keeps the rest, which prevents collapse of the spread
 LEVELS = 8  # rollouts are simulated to one of this many horizons, the shortest sufficient horizon
 # Added to the variances, in squared units of the trajectory's root mean square motion; unless the published pipeline is
 # asked for, the observation noise at the prior's medians is also added.
@@ -239,7 +241,8 @@ def _search(
         asked = optimiser.ask()
         state = step(key, state, problem, plan, config, asked)
         optimiser.tell(asked, state.losses[-1])
-        checkpoint.save(*_pack(state))
+        arrays = {"candidates": state.candidates, "losses": state.losses}
+        checkpoint.save(arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds})
         logbook.stage(len(state.losses) / len(plan.horizons), method="rfdropo", **state.trace[-1])
     return state, np.clip(optimiser.centre, 0.0, WIDTH)
 
@@ -265,11 +268,6 @@ def _choose(
     details["finalist_losses"] = scores.tolist()
     state.trace.append({"horizon": n, "loss": float(scores.min()), "rollouts": state.ledger.rollouts, "final": True})
     return finalists[int(np.argmin(scores))], details
-
-
-def _pack(state: SearchState) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    arrays = {"candidates": state.candidates, "losses": state.losses}
-    return arrays, {"ledger": state.ledger.record(), "trace": state.trace, "seconds": state.seconds}
 
 
 def _unpack(arrays: dict[str, np.ndarray], meta: dict[str, Any]) -> SearchState:
@@ -326,15 +324,11 @@ class CrossEntropy:
 
     Args:
         d, high, sigma, population, seed: see `make_optimiser`, sigma in the box's units.
-        elite: share of the candidates that the refit uses.
-        smoothing: weight of the new fit; the old fit keeps the rest, which prevents collapse of the spread.
     """
 
-    def __init__(
-        self, d: int, high: float, sigma: float, population: int, seed: int, elite: float = 0.3, smoothing: float = 0.7
-    ) -> None:
-        self.high, self.population, self.smoothing = high, population, smoothing
-        self.elites = max(2, round(elite * population))
+    def __init__(self, d: int, high: float, sigma: float, population: int, seed: int) -> None:
+        self.high, self.population = high, population
+        self.elites = max(2, round(ELITE * population))
         self.mean, self.sd = np.full(d, 0.5 * high), np.full(d, sigma)
         self._generator = np.random.default_rng(seed)
 
@@ -348,8 +342,8 @@ class CrossEntropy:
         """Refit to the elite. Deviations are taken from the OLD mean, so that the width does not collapse early."""
         best = candidates[np.argsort(losses, kind="stable")[: self.elites]]
         deviation = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
-        self.mean = self.smoothing * best.mean(axis=0) + (1.0 - self.smoothing) * self.mean
-        self.sd = self.smoothing * deviation + (1.0 - self.smoothing) * self.sd
+        self.mean = SMOOTHING * best.mean(axis=0) + (1.0 - SMOOTHING) * self.mean
+        self.sd = SMOOTHING * deviation + (1.0 - SMOOTHING) * self.sd
 
     @property
     def centre(self) -> Float[np.ndarray, " d"]:

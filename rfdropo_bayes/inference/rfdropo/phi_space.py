@@ -76,12 +76,12 @@ class SearchSpace(NamedTuple):
             for j, name in enumerate(self.names)
         }
 
-    def edge_cautions(self, vector: Float[np.ndarray, " k"], edge: float = 0.01) -> list[Caution]:
-        """A caution for every mean or standard deviation within ``edge`` of its range from an end of it."""
+    def edge_cautions(self, vector: Float[np.ndarray, " k"]) -> list[Caution]:
+        """A caution for every mean or standard deviation within a hundredth of its range from an end of it."""
         d, cautions = len(self.names), []
         for j, name in enumerate(self.names):
             for what, value in (("mean", vector[j]), ("standard deviation", vector[d + j])):
-                side = "lower" if value < edge * WIDTH else "upper" if value > (1.0 - edge) * WIDTH else None
+                side = "lower" if value < 0.01 * WIDTH else "upper" if value > 0.99 * WIDTH else None
                 if side and not (what == "standard deviation" and side == "lower"):
                     sentence = f"the {what} of {name} sits on the {side} end of its search range"
                     cautions.append(Caution(Code.SEARCH_EDGE, sentence))

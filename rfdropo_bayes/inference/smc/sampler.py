@@ -194,7 +194,12 @@ def step(
     moves = _affordable_moves(state, plan, horizon, problem.n_rows)
     population, info = stage(key, state.population, float(horizon), evaluate, min(moves, plan.most_moves))
     if not np.isfinite(info.log_evidence_increment):
-        raise _no_remainder(state, horizon)
+        raise NoLikelihoodError(
+            "the prior excludes the data: no parameter set has a positive likelihood "
+            f"up to row {horizon} ({state.ledger.reasons})",
+            where="[model.priors]",
+            remedy="widen the priors, or look at the simulator's reports for them",
+        )
     finished = population.progress == problem.n_rows
     evidence = state.log_evidence + info.log_evidence_increment
     prefix = state.prefix_log_evidence.copy()
@@ -251,15 +256,6 @@ def _affordable_moves(state: SmcState, plan: ReplicatePlan, horizon: int, n_rows
 def _facts(info: StageInfo) -> dict[str, Any]:
     kept = ("progress", "log_evidence_increment", "ess", "moves", "acceptance", "scale", "correlation")
     return {name: getattr(info, name) for name in kept}
-
-
-def _no_remainder(state: SmcState, horizon: int) -> NoLikelihoodError:
-    return NoLikelihoodError(
-        "the prior excludes the data: no parameter set has a positive likelihood "
-        f"up to row {horizon} ({state.ledger.reasons})",
-        where="[model.priors]",
-        remedy="widen the priors, or look at the simulator's reports for them",
-    )
 
 
 def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:

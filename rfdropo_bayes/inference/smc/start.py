@@ -233,9 +233,9 @@ def expected_way(problem: ResidualProblem, config: SmcConfig, key: PRNGKeyArray,
     return way_from_prior(problem, mode, horizons, way_key)
 
 
-def way_from_prior(problem: Problem, mode: Laplace, horizons: tuple[int, ...], key: PRNGKeyArray, n: int = 1000) -> Way:
+def way_from_prior(problem: Problem, mode: Laplace, horizons: tuple[int, ...], key: PRNGKeyArray) -> Way:
     """Expected stages and rollouts of a sampler that starts at the prior and adds the data at ``horizons``."""
-    prior = np.asarray(problem.to_unconstrained(problem.sample_prior(key, n)), dtype=float)
+    prior = np.asarray(problem.to_unconstrained(problem.sample_prior(key, 1000)), dtype=float)
     information, offset = _whitened(prior.mean(axis=0), np.atleast_2d(np.cov(prior.T)), mode)
     share = np.geomspace(1e-3 / max(float(information.max()), 1.0), 1.0, 2000)
     growth = 1.0 + share[:, None] * information
