@@ -70,7 +70,9 @@ def test_the_unit_that_is_tried_first_is_the_nearest(unit, ratio, likely):
 
 
 def test_commands_too_large_to_simulate_are_tried_smaller_and_forces_not_at_all():
-    assert [u.factor for u in likely_units(other_units(columns("m"), "m"), None)] == pytest.approx([0.1, 0.01, 1e-3])
+    assert [u.factor for u in likely_units(other_units(columns("m"), "m"), None)] == pytest.approx(
+        [0.1, 0.0254, 0.01, 1e-3]
+    )
     assert [u.name for u in likely_units(other_units(columns("cm"), "m"), None)] == ["mm", "", ""]
     assert other_units(None, "N") == []
     assert Unit("", 10.0) in other_units(None, "m")
