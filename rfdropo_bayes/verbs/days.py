@@ -83,5 +83,7 @@ def group_lines(days: Mapping[str, Sequence[int]]) -> list[str]:
     """The table [model.groups] of recordings of several days; empty for one day."""
     if not days:
         return []
-    lines = [f'"{day}" = "*{day}*"' for day in days]
+    # The pattern of day 1 must not hold day 10.
+    numbered = [day for day in days if day[0].isalpha() and day[-1].isdigit()]
+    lines = [f'"{day}" = ["*{day}", "*{day}[!0-9]*"]' if day in numbered else f'"{day}" = "*{day}*"' for day in days]
     return ["[model.groups]  # ASSUMED: days, by the names of the recordings", *lines, ""]

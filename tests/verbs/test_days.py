@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import tomllib
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from rfdropo_bayes.groups import gather_groups
 from rfdropo_bayes.verbs.days import ROWS_AT_REST, Piece, days_of, group_lines, pieces_of
 
 
@@ -26,6 +28,13 @@ from rfdropo_bayes.verbs.days import ROWS_AT_REST, Piece, days_of, group_lines, 
 def test_days_are_told_by_names(names, days):
     assert days_of([Path(name) for name in names]) == days
     assert len(group_lines(days)) == (len(days) + 2 if days else 0)
+
+
+@pytest.mark.parametrize("names", [("run_day1", "run_day10_b"), ("Session 2", "Session 21"), ("day1_a", "day10")])
+def test_the_group_of_a_day_holds_no_other_day(names):
+    days = days_of([Path(f"{name}.csv") for name in names])
+    groups = tomllib.loads("\n".join(group_lines(days)))["model"]["groups"]
+    assert list(gather_groups(names, groups).values()) == [(name,) for name in names]
 
 
 def test_the_last_third_is_kept_for_a_test_unless_there_are_few_rows():
