@@ -222,7 +222,8 @@ def write_first_files(
         return robot, experiment
     seen = runs[0]
     bends = outline.sets_bend is not None
-    registration = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed, bends=bends)
+    scaled, stiff = ("length" in outline.assumed), ("young_modulus" in outline.assumed)
+    registration = register(spec_of(placed, folder), seen, scaled=scaled, bends=bends, stiff=stiff)
     ordered, order = guess, None
     if registration.arrangement is not None:
         turns = np.degrees(registration.arrangement.turns)
@@ -241,8 +242,9 @@ def write_first_files(
         if registration.frame is None
         else f"a rod at rest explains {100 * registration.frame.explained:.3g} % of the motion"
     )
-    if registration.frame is not None and (registration.frame.scale, registration.bend) != (1.0, 1.0):
-        outline = outline.resized(registration.frame.scale, registration.bend, f"{explained} with them")
+    if registration.frame is not None:
+        sizes = (registration.frame.scale, registration.bend, registration.softness)
+        outline = outline if sizes == (1.0, 1.0, 1.0) else outline.resized(*sizes, f"{explained} with them")
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
     if registration.frame is not None:
