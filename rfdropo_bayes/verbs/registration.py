@@ -35,7 +35,8 @@ BENDS = tuple(np.geomspace(1.0 / 8.0, 8.0, 13))
 """Factors of the bend of a command that are tried if no answer sets it, a factor of 1.4 apart. An arm whose cables lie
 at half the assumed distance, and whose spool is a guess, bent 2.1 times as far."""
 
-LIKELY = 4  # exchanges that are looked at closely
+ENOUGH = 0.99  # share at or above which no exchange of channels is looked for
+LIKELY = 4  # exchanges that are looked at with all compliances
 ACROSS = 0.1  # least share of gravity across the body that shows the azimuth of the cables
 TURNS = tuple(
     float(turn) for turn in np.arange(12) * 2.0 * np.pi / 12.0
@@ -230,13 +231,15 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
         if better is not None and ALIKE * better.unexplained < chosen.unexplained:
             evidence = _explains(better, chosen)
             chosen = better
-    exchanged = [sights.far(each, chosen, sights.soft[::3]) for each in _exchanged(chosen.arrangement, own)]
-    likely = sorted((each for each in exchanged if each is not None), key=lambda each: each.unexplained)
-    far = _best(sights.far(each.arrangement, chosen, sights.soft) for each in likely[: LIKELY if sights.lies else 1])
-    better = None if far is None else sights.near(far)
-    if better is not None and better.unexplained <= UNEXPLAINED * chosen.unexplained:
-        evidence = _explains(better, chosen)
-        chosen = better
+    if chosen.frame.explained < ENOUGH:
+        exchanged = [sights.far(each, chosen, sights.soft[::3]) for each in _exchanged(chosen.arrangement, own)]
+        likely = sorted((each for each in exchanged if each is not None), key=lambda each: each.unexplained)
+        likely = likely[: LIKELY if len(sights.soft) > 1 else 1]
+        far = _best(sights.far(each.arrangement, chosen, sights.soft) for each in likely)
+        better = None if far is None else sights.near(far)
+        if better is not None and better.unexplained <= UNEXPLAINED * chosen.unexplained:
+            evidence = _explains(better, chosen)
+            chosen = better
     arrangement = None if chosen.arrangement == start else chosen.arrangement
     if chosen.frame.explained < EXPLAINED:
         return Registration(None, arrangement, evidence)
