@@ -353,7 +353,7 @@ def _cables(o: RobotOutline) -> list[str]:
     names = o.cable_names()
     for row in range(o.segments * o.cables):
         segment, cable = divmod(row, o.cables)
-        azimuth = 360.0 / o.cables * cable + o.first_azimuths()[segment]
+        azimuth = (360.0 / o.cables * cable + o.first_azimuths()[segment]) % 360.0
         inside = heights <= o.end_of_cables(segment) + 1e-9
         lines += [
             "[[cables]]",

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import Trajectory
@@ -43,7 +43,10 @@ TURNS = tuple(
 )  # turns of all cables about the axis of a body that lies [rad]
 SOFTNESS = tuple(np.geomspace(1.0 / 8.0, 8.0, 7))  # compliances that are tried if the stiffness was not given
 NOTHING = 1e3  # unexplained share of a turn at which the rod finds no equilibria
-FINELY = np.radians(1.0)  # accuracy of the best turn [rad]
+MINIMA = 3  # turns from which the best is sought
+TURNED, SOFTER, EVALUATIONS = np.radians(15.0), 0.3, 30
+"""First steps of the turn [rad] and of the logarithm of the compliance, and the most steps."""
+FINELY = np.radians(0.5)  # accuracy of the best turn [rad]
 
 
 class Frame(NamedTuple):
@@ -159,23 +162,35 @@ class _Sights:
         """An arrangement in all rows, as written."""
         return self.of(arrangement, self.rows, self.bends)
 
-    def far(self, arrangement: Arrangement, like: _Sight, soft: Sequence[float]) -> _Sight | None:
-        """The best sight in fewer rows; of a body that lies, of all turns about the axis, with the bend of another."""
+    def far(self, arrangement: Arrangement, like: _Sight, soft: Sequence[float]) -> list[_Sight]:
+        """Good sights in fewer rows, best first; of a body that lies, turns about the axis that are better than their
+        neighbours, with the bend of another sight."""
         if not self.lies:
-            return self.of(arrangement, self.fewer, self.bends)
-        return _best(self.of(arrangement.turned(turn), self.fewer, (like.bend,), soft) for turn in TURNS)
+            sights = [self.of(arrangement, self.fewer, self.bends)]
+            return [each for each in sights if each is not None]
+        sights = [self.of(arrangement.turned(turn), self.fewer, (like.bend,), soft) for turn in TURNS]
+        left = np.array([np.inf if each is None else each.unexplained for each in sights])
+        lowest = np.flatnonzero((left <= np.roll(left, 1)) & (left <= np.roll(left, -1)) & np.isfinite(left))
+        return [each for k in lowest[np.argsort(left[lowest])] if (each := sights[k]) is not None]
 
     def near(self, sight: _Sight) -> _Sight | None:
-        """The best sight in all rows; of a body that lies, of turns near those of a sight."""
+        """The best sight in all rows; of a body that lies, of turns and compliances near those of a sight."""
         sights: list[_Sight | None] = []
 
-        def unexplained(turn: float) -> float:
-            sights.append(self.of(sight.arrangement.turned(float(turn)), self.rows, self.bends, (sight.softness,)))
-            return NOTHING if sights[-1] is None else sights[-1].unexplained
+        def unexplained(steps: Float[np.ndarray, " step"]) -> float:
+            turn, factor = float(steps[0]), float(np.exp(np.sum(steps[1:])))
+            bend, soft = (factor, 1.0) if self.held_by_force else (1.0, factor)
+            arrangement = sight.arrangement.turned(turn)
+            made = self.of(arrangement, self.rows, (bend * sight.bend,), (soft * sight.softness,))
+            sights.append(made)
+            return NOTHING if made is None else made.unexplained
 
-        unexplained(0.0)
+        sights.append(self.of(sight.arrangement, self.rows, self.bends, (sight.softness,)))
         if self.lies:
-            minimize_scalar(unexplained, bounds=(-TURNS[1], TURNS[1]), method="bounded", options={"xatol": FINELY})
+            free = len(self.bends) > 1 if self.held_by_force else len(self.soft) > 1
+            first = np.diag([TURNED, SOFTER])[: 1 + free, : 1 + free]
+            simplex = {"initial_simplex": np.vstack([-0.5 * first.sum(axis=0), first]), "maxfev": EVALUATIONS}
+            minimize(unexplained, np.zeros(1 + free), method="Nelder-Mead", options=simplex | {"xatol": FINELY})
         return _best(sights)
 
 
@@ -226,17 +241,20 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
                 f"the motion agrees to {finding.agreement:.2f} with a rod at rest, and to "
                 f"{finding.written.straight:.2f} without"
             )
-    if sights.lies and (turned := sights.far(chosen.arrangement, chosen, sights.soft)) is not None:
-        better = sights.near(turned)
+    if sights.lies:
+        better = _best(map(sights.near, sights.far(chosen.arrangement, chosen, sights.soft)[:MINIMA]))
         if better is not None and ALIKE * better.unexplained < chosen.unexplained:
             evidence = _explains(better, chosen)
             chosen = better
     if chosen.frame.explained < ENOUGH:
-        exchanged = [sights.far(each, chosen, sights.soft[::3]) for each in _exchanged(chosen.arrangement, own)]
-        likely = sorted((each for each in exchanged if each is not None), key=lambda each: each.unexplained)
-        likely = likely[: LIKELY if len(sights.soft) > 1 else 1]
-        far = _best(sights.far(each.arrangement, chosen, sights.soft) for each in likely)
-        better = None if far is None else sights.near(far)
+        exchanged = [
+            each
+            for one in _exchanged(chosen.arrangement, own)
+            for each in sights.far(one, chosen, sights.soft[::3])[:1]
+        ]
+        likely = sorted(exchanged, key=lambda each: each.unexplained)[: LIKELY if len(sights.soft) > 1 else 1]
+        closer = [each for one in likely for each in sights.far(one.arrangement, chosen, sights.soft)]
+        better = _best(map(sights.near, sorted(closer, key=lambda each: each.unexplained)[:MINIMA]))
         if better is not None and better.unexplained <= UNEXPLAINED * chosen.unexplained:
             evidence = _explains(better, chosen)
             chosen = better
