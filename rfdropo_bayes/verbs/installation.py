@@ -14,7 +14,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.mechanisms.sizes import scales_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import sections_of
-from rfdropo_bayes.verbs.registration import Frame
+from rfdropo_bayes.verbs.registration import Frame, lies
 
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
@@ -39,11 +39,13 @@ def largest_pull(robot: Robot, recording: Trajectory) -> float:
 def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[str]:
     """Mechanisms of the base model: the measuring frame, the body's stiffness in tension, the gain of the drives, the
     scale of lengths if the body's length was ``assumed``, and of a robot with several sections, whose cables pull
-    against each other and whose sections are turned by hand, the stretch and the azimuths of its cables."""
+    against each other and whose sections are turned by hand, the stretch and the azimuths of its cables. Gravity turns
+    about the axis of a body that lies, if the azimuths of its cables were assumed."""
     gain = ["command_gain"] if robot.command_unit in ("m", *UNSTATED) else []
     scale = ["camera_scale"] if "length" in assumed else []
     sections = ["cable_compliance", "guide_azimuth"] if _pulled_by_section(robot) else []
-    return ["axial_stiffness", "camera_rotation", *gain, *scale, *sections]
+    tilt = ["base_tilt"] if lies(robot) and "segment_azimuths" in assumed else []
+    return ["axial_stiffness", "camera_rotation", *gain, *scale, *sections, *tilt]
 
 
 def _pulled_by_section(robot: Robot) -> bool:
@@ -78,6 +80,8 @@ def installed_priors(
         normal(f"offset_{axis}", ORIGIN * robot.length, words, place)
     for axis, angle, wide in zip("xyz", turn, (TILT, TILT, TURN), strict=True):
         normal(f"camera_rotation_{axis}", wide, f"turn of the measuring frame{explained}", angle)
+    if lies(robot) and "segment_azimuths" in assumed:
+        normal("base_tilt", TILT, "direction of gravity, about the axis and along it")
     if robot.command_unit == "m":
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")

@@ -101,6 +101,11 @@ def frame_of(
     return Frame(rotation, shift, scale, float(1.0 - np.sum((moved + shift - seen) ** 2) / motion))
 
 
+def lies(robot: Robot) -> bool:
+    """Whether a robot's weight bends it, which the azimuths of its cables decide on."""
+    return bool(np.linalg.norm(robot.gravity[:2]) > ACROSS * np.linalg.norm(robot.gravity))
+
+
 class _Sight(NamedTuple):
     """An arrangement of a robot in the frame, and with the bend, that bring it nearest to a recording."""
 
@@ -134,7 +139,7 @@ class _Sights:
         self.rows = rows.of(spread_rows(rows, ROWS))
         self.fewer = self.rows.of(spread_rows(self.rows, SEARCHED))
         self.held_by_force, self.modulus = own.held_by_force, own.nominal()["young_modulus"]
-        self.lies = bool(np.linalg.norm(own.gravity[:2]) > ACROSS * np.linalg.norm(own.gravity))
+        self.lies = lies(own)
         self.soft = soft if self.lies and not self.held_by_force else (1.0,)
 
     def of(
