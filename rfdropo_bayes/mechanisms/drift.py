@@ -64,9 +64,7 @@ class Drift:
         return sizes
 
 
-def rates_over(
-    duration: float, specs: Iterable[ParameterSpec], mechanisms: Iterable[Any]
-) -> tuple[ParameterSpec, ...]:
+def rates_over(duration: float, specs: Iterable[ParameterSpec], mechanisms: Iterable[Any]) -> tuple[ParameterSpec, ...]:
     """Parameters of a model with priors of rates by which sizes change, over a duration [s], by the scale of their own
     prior.
     """

@@ -173,8 +173,9 @@ class RobotOutline:
     @property
     def bending_force(self) -> float:
         """Tension, or thrust of a chamber, that bends the body by a usual pull [N], see `mechanisms.sizes`."""
-        moment = float(np.mean(section_profile([self.section]).bending_moment_area_m4))
-        return self.young_modulus * moment * USUAL_PULL / self.arm**2
+        ends = np.array([[self.arm, 0.0, 0.0], [self.arm, 0.0, self.length]])
+        give = section_profile([self.section]).shortening(ends)
+        return self.young_modulus * USUAL_PULL * self.length / give
 
     @property
     def sets_bend(self) -> str | None:

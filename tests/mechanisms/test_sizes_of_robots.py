@@ -77,3 +77,9 @@ def test_a_size_drifts_by_its_own_prior_over_a_recording():
         assert [seconds * each.prior["scale"] for each in rates] == pytest.approx(
             [each.prior["scale"] for each in size.parameters]
         )
+
+
+def test_wider_disks_on_a_backbone_hardly_change_the_force_that_bends_a_robot():
+    given = {"name": "arm", "length": 0.18, "cable_radius": 0.0045, "markers": {"tip": 0.18}, "young_modulus": 5e10}
+    disks = [Robot.outline(**given, shape="disks", radius=r, inner_radius=0.0006) for r in (0.006, 0.012)]
+    assert scales_of(disks[1]).force == pytest.approx(scales_of(disks[0]).force, rel=1e-3)
