@@ -195,11 +195,6 @@ class ObjectPose(Series):
         memory = [] if tau is None else [float(np.exp(-step / tau))]
         return Autoregression(sizes, np.array([1.0, *memory]), STATED, np.inf, step=step)
 
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time 7"]:
-        clean, keys = self.expected(seen), jax.random.split(key, len(self.readings))
-        drawn = jax.vmap(lambda k, p, t: draw_object_error(k, p, t, seen.values, self.known))
-        return jnp.where(self.line.valid, drawn(keys, clean, jnp.asarray(self.time)), 0.0)
-
     @property
     def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
         return np.repeat(self.line.valid, 6, axis=-1)
@@ -210,13 +205,6 @@ class ObjectPose(Series):
         turn = _turn_since_start(readings[..., 3:])
         none = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), turn.shape)
         return jnp.concatenate([readings[..., :3], LEVER * turn_between(none, turn)], axis=-1)
-
-    def draw_features(
-        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
-    ) -> Float[Array, "time feature"]:
-        """See `FeatureChannel`; for turns much smaller than one."""
-        error = _error(key, time, values, self.known)
-        return jnp.concatenate([error[:, 0], LEVER * error[:, 1]], axis=1)
 
     def feature_deviation(self, values: Mapping[str, Any]) -> Float[np.ndarray, " feature"]:
         """See `FeatureChannel`: long after the start."""
@@ -238,13 +226,13 @@ def draw_object_error(
     known: Autoregression | None = None,
 ) -> Float[Array, "time 7"]:
     """A body's poses with a realisation of the noise of centre and turn; the first row has no noise."""
-    error = _error(key, time, values, known)
+    error = object_error(key, time, values, known)
     half = 0.5 * jnp.linalg.norm(error[:, 1], axis=1, keepdims=True)
     turn = jnp.concatenate([0.5 * jnp.sinc(half / jnp.pi) * error[:, 1], jnp.cos(half)], axis=1)
     return jnp.concatenate([pose[:, :3] + error[:, 0], product(turn, pose[:, 3:])], axis=1)
 
 
-def _error(
+def object_error(
     key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any], known: Autoregression | None
 ) -> Float[Array, "time 2 3"]:
     """Noise of centre [m] and turn [rad].
