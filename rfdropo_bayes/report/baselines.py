@@ -1,24 +1,26 @@
-"""The predictors a sceptic would use instead of a simulator: a held pose, a copied mean, repeats, a regression on the
-commands.
+"""The predictors a sceptic would use instead of a simulator: a held pose, a copy of repeats or of earlier sessions, a
+regression on the commands.
 
 They use no model of the robot. A calibrated simulator that does not beat them has not earned its keep.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory, command_openings, group_repeats, same_opening
-from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report.fir import FirRegression, fit_fir
-from rfdropo_bayes.report.scores import ErrorFigures, measured_paths, score
+from rfdropo_bayes.report.scores import ErrorFigures, MeasuredPath, measured_paths, score
 
 Predictor = Callable[[Trajectory], Float[np.ndarray, "time marker 3"]]
+Predictors = Mapping[str, tuple[str, str, Predictor]]
+"""Title, description and predictor, by name."""
+Openings = Mapping[str, Mapping[str, str]]
 
 
 @dataclass(frozen=True)
@@ -34,11 +36,11 @@ class BaselineErrors:
     reason: str = ""  # why it could not predict; empty if it could
 
 
-def held_initial_pose(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-    """The first usable position of each marker, held constant."""
-    first = np.argmax(recording.position_mask, axis=0)
-    pose = recording.position[first, np.arange(recording.position.shape[1])]
-    return np.broadcast_to(pose, recording.position.shape)
+def held_pose(shown: Trajectory) -> Predictor:
+    """The first usable position of each marker of a recording, held constant."""
+    first = np.argmax(shown.position_mask, axis=0)
+    pose = shown.position[first, np.arange(shown.position.shape[1])]
+    return lambda recording: np.broadcast_to(pose, recording.position.shape)
 
 
 def mean_pose(fit: Sequence[Trajectory]) -> Predictor:
@@ -49,74 +51,89 @@ def mean_pose(fit: Sequence[Trajectory]) -> Predictor:
     return lambda recording: np.broadcast_to(pose, recording.position.shape)
 
 
-def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
-    """The mean of the fit recordings at the same time after the start, for any command.
+def repeated_mean(earlier: Sequence[MeasuredPath], openings: Openings) -> Predictor:
+    """The mean of other recordings of the same commands at the same time; their last pose is held after their end.
 
-    A fit recording is predicted by the others. The predictor raises InputError if no other recording lasts as long.
+    The predictor raises InputError if no other recording has the commands, or none of these shows a marker.
+
+    Args:
+        earlier: recordings to copy.
+        openings: first commands of each, by name, see `command_openings`.
     """
 
     def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-        others = [source for source in fit if source.sha256 != recording.sha256 or source.name != recording.name]
-        total = np.zeros(recording.position.shape)
-        count = np.zeros(recording.position.shape[:2])
-        for source in others:
-            within = recording.time <= source.time[-1] + _tolerance(source)
-            for marker in range(recording.position.shape[1]):
-                usable = source.position_mask[:, marker]
-                if usable.any():
-                    path, time = source.position[usable, marker], source.time[usable]
-                    for axis in range(3):
-                        total[:, marker, axis] += within * np.interp(recording.time, time, path[:, axis])
-                    count[:, marker] += within
-        if not count.all():
-            raise InputError(
-                f"no other fitted recording lasts {recording.time[-1]:.4g} s, as this recording does",
-                where=recording.name,
-            )
-        return total / count[..., None]
-
-    return predict
-
-
-def repeated_mean(fit: Sequence[Trajectory]) -> Predictor:
-    """The mean of the fitted repeats of the same commands at the same time; their last pose is held after their end.
-
-    The predictor raises InputError if no other fit recording has the commands.
-    """
-    openings = [command_openings(source) for source in fit]
-
-    def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-        own = command_openings(recording)
-        repeats = [
-            source
-            for source, begun in zip(fit, openings, strict=True)
-            if same_opening(own, begun) and (source.sha256 != recording.sha256 or source.name != recording.name)
-        ]
-        if not repeats:
+        own, mean = command_openings(recording), np.zeros(recording.position.shape)
+        alike = [p for p in earlier if p.name != recording.name and same_opening(own, openings.get(p.name, {}))]
+        if not alike:
             raise InputError("no other fitted recording has the same commands", where=recording.name)
-        total, count = np.zeros(recording.position.shape), np.zeros(recording.position.shape[1])
-        for source in repeats:
-            for marker in np.flatnonzero(source.position_mask.any(axis=0)):
-                usable = source.position_mask[:, marker]
-                path, time = source.position[usable, marker], source.time[usable]
-                total[:, marker] += np.stack([np.interp(recording.time, time, path[:, i]) for i in range(3)], axis=-1)
-                count[marker] += 1
-        if not count.all():
-            raise InputError("a marker was lost in all fitted recordings with the same commands", where=recording.name)
-        return total / count[:, None]
+        for column, marker in enumerate(recording.marker_names):
+            seen = [p for p in alike if marker in p.marker_names and p.mask[:, p.marker_names.index(marker)].any()]
+            if not seen:
+                what = f"{marker} was lost in all fitted recordings with the same commands"
+                raise InputError(what, where=recording.name)
+            for path in seen:
+                index = path.marker_names.index(marker)
+                time, position = path.time[path.mask[:, index]], path.position[path.mask[:, index], index]
+                mean[:, column] += np.stack([np.interp(recording.time, time, axis) for axis in position.T], axis=-1)
+            mean[:, column] /= len(seen)
+        return mean
 
     return predict
+
+
+def scaled_copy(shown: Trajectory, copied: Predictor) -> Predictor:
+    """A copy, with a scale and a shift of each marker by least squares on the known part of the session."""
+
+    def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
+        copy, scaled = copied(shown), copied(recording)
+        for marker in range(scaled.shape[1]):
+            rows = shown.position_mask[:, marker]
+            there, here = copy[rows, marker], shown.position[rows, marker]
+            middle, about = there.mean(axis=0), here.mean(axis=0)
+            power = float(np.sum((there - middle) ** 2))
+            scale = float(np.sum((there - middle) * (here - about))) / power if power > 0.0 else 1.0
+            scaled[:, marker] = about + scale * (scaled[:, marker] - middle)
+        return scaled
+
+    return predict
+
+
+def session_baselines(
+    shown: Trajectory, tested: Sequence[Trajectory], earlier: Sequence[MeasuredPath], openings: Openings
+) -> dict[str, BaselineErrors]:
+    """Errors of predictions of a session without a model.
+
+    Args:
+        shown: the known part of the session.
+        tested: the predicted part.
+        earlier: fitted recordings.
+        openings: first commands of each, see `command_openings`.
+    """
+    copied = repeated_mean(earlier, openings)
+    predictors: Predictors = {
+        "first_row": (
+            "first row of the session held",
+            "the first known pose of the session, held constant",
+            held_pose(shown),
+        ),
+        "copied": (
+            "earlier sessions copied",
+            "mean of the fitted recordings of the same commands at the same time",
+            copied,
+        ),
+        "scaled_copy": (
+            "earlier sessions copied and scaled",
+            "the same copy, with a scale and a shift of each marker fitted to the known part of the session",
+            scaled_copy(shown, copied),
+        ),
+    }
+    return _scored(predictors, [shown], tested)
 
 
 def with_fitted_commands(fit: Sequence[Trajectory], test: Sequence[Trajectory]) -> list[str]:
     """Names of the test recordings whose commands were also fitted, in the same or another recording."""
     openings = [command_openings(source) for source in fit]
     return [t.name for t in test if any(same_opening(command_openings(t), begun) for begun in openings)]
-
-
-def _tolerance(recording: Trajectory) -> float:
-    """Repeats end a little apart, with the jitter of their clocks."""
-    return 2.0 * sample_time(recording.time)
 
 
 def baseline_errors(
@@ -140,26 +157,23 @@ def baseline_errors(
     trained_on = f"{seconds:.4g} s in {len(fit)} recording{'s' if len(fit) != 1 else ''}"
     groups = [list(group) for group in group_repeats(fit)]
     linear, cubic = fit_fir(fit, groups, degree=1), fit_fir(fit, groups, degree=3)
-    predictors: dict[str, tuple[str, str, Predictor]] = {
-        "initial_pose": ("initial pose held", "each recording's own first pose, held constant", held_initial_pose),
-        "mean_pose": ("constant mean pose", f"mean pose of the fit recordings ({trained_on})", mean_pose(fit)),
-        "copied_mean": (
-            "fit mean copied",
-            f"mean of the fit recordings ({trained_on}) at the same time, whatever is commanded",
-            copied_mean(fit),
+    repeated = repeated_mean(measured_paths(fit), {t.name: command_openings(t) for t in fit})
+    predictors: Predictors = {
+        "initial_pose": (
+            "initial pose held",
+            "each recording's own first pose, held constant",
+            lambda recording: held_pose(recording)(recording),
         ),
+        "mean_pose": ("constant mean pose", f"mean pose of the fit recordings ({trained_on})", mean_pose(fit)),
         "repeated_mean": (
             "mean of fitted repeats",
             "mean of the fit recordings of the same commands at the same time",
-            repeated_mean(fit),
+            repeated,
         ),
         "fir_linear": ("linear FIR", _describe(linear, trained_on), linear.predict),
         "fir_cubic": ("cubic FIR", _describe(cubic, trained_on), cubic.predict),
     }
-    return {
-        name: scored(name, title, description, predict, fit, test)
-        for name, (title, description, predict) in predictors.items()
-    }
+    return _scored(predictors, fit, test)
 
 
 def _with_markers(recording: Trajectory, markers: Sequence[str]) -> Trajectory:
@@ -178,16 +192,17 @@ def _describe(fir: FirRegression, trained_on: str) -> str:
     )
 
 
-def scored(
-    name: str, title: str, description: str, predict: Predictor, fit: Sequence[Trajectory], test: Sequence[Trajectory]
-) -> BaselineErrors:
-    """Errors of a predictor on the fitted and the test recordings, or the reason if it cannot predict."""
-    figures: list[ErrorFigures | None] = []
-    reason = ""
-    for recordings in (fit, test):
-        try:
-            figures.append(score({t.name: predict(t) for t in recordings}, measured_paths(recordings)))
-        except InputError as error:
-            figures.append(None)
-            reason = str(error)
-    return BaselineErrors(name, title, description, figures[0], figures[1], reason)
+def _scored(predictors: Predictors, fit: Sequence[Trajectory], test: Sequence[Trajectory]) -> dict[str, BaselineErrors]:
+    """Errors of predictors on the fitted and the test recordings, or the reason if one cannot predict."""
+    errors = {}
+    for name, (title, description, predict) in predictors.items():
+        figures: list[ErrorFigures | None] = []
+        reason = ""
+        for recordings in (fit, test):
+            try:
+                figures.append(score({t.name: predict(t) for t in recordings}, measured_paths(recordings)))
+            except InputError as error:
+                figures.append(None)
+                reason = str(error)
+        errors[name] = BaselineErrors(name, title, description, figures[0], figures[1], reason)
+    return errors
