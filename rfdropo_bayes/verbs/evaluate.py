@@ -163,8 +163,8 @@ def _episodes_for(
 
 
 def _otherwise_trained(policies: Mapping[str, ExportedPolicy], integrator: str) -> list[str]:
-    """Sentences on policies that were trained with another integrator; the default is Euler's."""
-    trained = {name: policy.facts.get(INTEGRATOR, "euler") for name, policy in policies.items()}
+    """Sentences on policies that were trained with another integrator."""
+    trained = {name: policy.facts.get(INTEGRATOR, integrator) for name, policy in policies.items()}
     return [
         f"{name} was trained with integrator {given!r}, and is evaluated with {integrator!r}."
         for name, given in trained.items()

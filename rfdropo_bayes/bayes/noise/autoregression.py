@@ -116,7 +116,7 @@ class Autoregression:
             given["source"],
             np.inf if freedom is None else freedom,
             None if across is None else np.array(across),
-            given.get("step"),  # missing in earlier versions
+            given["step"],
         )
 
     @cached_property
