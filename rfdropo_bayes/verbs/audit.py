@@ -52,8 +52,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.report import software_versions
-from rfdropo_bayes.report.audit_page import render_audit, shown
-from rfdropo_bayes.report.residual_file import residual_dataset
+from rfdropo_bayes.report.audit_page import render_audit, residual_dataset, shown
 from rfdropo_bayes.report.run_files import SUMMARY
 from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit
