@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
-from rfdropo_bayes.mechanisms.sizes import USUAL, scaled
+from rfdropo_bayes.mechanisms.sizes import USUAL, half_normal, log_normal, normal, scaled
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
-from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import ParameterSpec
 
 SPOOL = 0.02  # [m], radius of a usual spool, for motors of which no usual command is known
 POWERS = {"m": 1, "m/s": 1, "1/m": -1, "s/m": -1}  # of a length in each unit

@@ -25,7 +25,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.interrupts import stop_if_asked_twice
 from rfdropo_bayes.policies.evaluation import Case, Episode, draw_cases, peak_tension, play
-from rfdropo_bayes.policies.parity import check_exportable
+from rfdropo_bayes.policies.onnx_export import check_exportable
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.tables import nearest
 

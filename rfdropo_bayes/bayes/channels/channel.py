@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.parameters import ParameterSpec
-from rfdropo_bayes.simulators.protocol import Observation
+from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec
 
 
 class Seen(NamedTuple):

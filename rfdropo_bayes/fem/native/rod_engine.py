@@ -30,8 +30,8 @@ from rfdropo_bayes.fem.native.contact_records import (
     touch_storage,
 )
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows, load_rows
+from rfdropo_bayes.fem.native.fields import in_blocks
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
-from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.rod_effects import LOADED
 from rfdropo_bayes.fem.native.rod_records import (
@@ -49,7 +49,7 @@ from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rod import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.section_loads import SectionLoads
+from rfdropo_bayes.fem.sections import SectionLoads
 from rfdropo_bayes.runtime import available_processors
 
 Precision = Literal["float64", "float32"]

@@ -19,14 +19,14 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
 from rfdropo_bayes.fem.native.contact_records import Cubes
 from rfdropo_bayes.fem.native.effect_rows import load_rows
-from rfdropo_bayes.fem.native.lane_blocks import in_blocks
+from rfdropo_bayes.fem.native.fields import in_blocks
 from rfdropo_bayes.fem.native.rod_effects import LOADED
 from rfdropo_bayes.fem.native.rod_engine import NativeRod, Records, Run
 from rfdropo_bayes.fem.native.rod_records import RodSamples
 from rfdropo_bayes.fem.native.rod_tables import as_kernel_array
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.section_loads import SectionLoads
+from rfdropo_bayes.fem.sections import SectionLoads
 
 KEPT = {
     "samples": tuple(name for name in RodSamples._fields if name != "present"),
