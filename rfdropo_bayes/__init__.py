@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from rfdropo_bayes.robots.sections import section_profile as section_profile
     from rfdropo_bayes.simulators.adapters.mujoco_model import MuJoCo as MuJoCo
     from rfdropo_bayes.simulators.black_box import BlackBox as BlackBox
-    from rfdropo_bayes.simulators.protocol import ParameterSpec as ParameterSpec
+    from rfdropo_bayes.simulators.parameters import ParameterSpec as ParameterSpec
     from rfdropo_bayes.verbs.adapt import adapt as adapt
     from rfdropo_bayes.verbs.audit import AuditOptions as AuditOptions
     from rfdropo_bayes.verbs.audit import audit as audit

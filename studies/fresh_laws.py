@@ -13,7 +13,7 @@ from rfdropo_bayes.mechanisms.actuation import NUMBERED, kept_over
 from rfdropo_bayes.mechanisms.sizes import half_normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 BOUC_WEN_WAY = 1.5e-3  # m of travel over which a hysteresis builds up
 

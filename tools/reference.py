@@ -49,7 +49,7 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
 from rfdropo_bayes.simulators.adapters.mujoco_elements import ATTRIBUTES, Attribute
 from rfdropo_bayes.simulators.mechanisms import STAGES
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "reference"
 NOTE = "<!-- Written by tools/reference.py from the code: change the code, then run it. -->"

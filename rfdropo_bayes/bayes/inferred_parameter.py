@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from rfdropo_bayes.bayes.priors import confined, prior_from_table
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import SHARED, ParameterInfo, Scope
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 INTERIOR = 15.0  # in unconstrained space: within 3e-7 of the width of a bound
 

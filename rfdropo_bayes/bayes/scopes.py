@@ -15,7 +15,7 @@ from rfdropo_bayes.bayes.inferred_parameter import InferredParameter, Pooled, de
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import DrawsByOwner, ParameterInfo, Scope
-from rfdropo_bayes.simulators.protocol import ParameterSpec, check_names
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 
 HALF_NORMAL_MEDIAN = 0.6745
 

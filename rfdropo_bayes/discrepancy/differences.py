@@ -20,7 +20,7 @@ from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import MEASURED_FROM_NULL, PRIOR_DRAWS
 from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, families, stem
 from rfdropo_bayes.posteriors import Scope
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 WHERE = "--between"
 

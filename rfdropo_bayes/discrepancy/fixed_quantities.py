@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from rfdropo_bayes.bayes.inferred_parameter import InferredParameter
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.discrepancy.candidates import Candidate
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 ZEROS = "initial_displacement"  # of cables, see `Robot`
 MEASURED = "offset_"  # of the frame: `camera_offset` is the library's name for it

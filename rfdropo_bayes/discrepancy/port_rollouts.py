@@ -25,7 +25,7 @@ from rfdropo_bayes.mechanisms.sizes import normal
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands, observed_at
 from rfdropo_bayes.simulators.extended import ExtendedSimulator
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.robot_simulator import PASSES, RobotSimulator
 
 Signals = Float[np.ndarray, "lane row"]

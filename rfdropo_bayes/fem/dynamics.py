@@ -90,7 +90,7 @@ class Prepared(NamedTuple):
     rayleigh_stiffness: Float[Array, ""]
     rest_length: Float[Array, " cables"]  # cable lengths of the undeformed body [m]
     effects: BodyEffects
-    firmness: Float[Array, ""] | None = None  # factor on the stiffness in a step, see ``sections``
+    firmness: Float[Array, ""] | None = None  # factor on the stiffness in a step, see ``section_loads``
 
     @property
     def weight(self) -> Float[Array, "stations 3"]:
@@ -261,7 +261,7 @@ def within(system: System, prepared: Prepared, state: State, time_step: Scalar, 
 
 
 def firm(prepared: Prepared, memory: Memory) -> Sections:
-    """The sections with their stiffness after softening and loads of sections."""
+    """The sections with their stiffness after softening and ``section_loads``."""
     section, stiffness = prepared.section, None
     if prepared.effects.softening_rate is not None and memory.clock is not None:
         stiffness = jnp.exp(-prepared.effects.softening_rate * memory.clock)

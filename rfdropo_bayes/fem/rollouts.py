@@ -18,7 +18,7 @@ from rfdropo_bayes.fem.integrators import Integrator
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.fem.rod import PointMap, point_positions
-from rfdropo_bayes.fem.sections import SectionLoads, loaded
+from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
 
 
 class Rollout(NamedTuple):

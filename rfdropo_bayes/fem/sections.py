@@ -6,34 +6,15 @@ The bending law is a symmetric matrix of bending and twist. The fibre law gives 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.fem.components import diagonal, dot, times
-from rfdropo_bayes.fem.dynamics import Prepared, System
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Scalar
 from rfdropo_bayes.fem.rod import SHEAR, Rod, shear_ratios
-
-
-class SectionLoads(NamedTuple):
-    """Signals; row 0 acts on the initial equilibrium, row k during the k-th step.
-
-    Attributes:
-        force: forces on the sections at some stations [N].
-        stiffness, damping: logarithms of factors on the stiffness and on both Rayleigh coefficients.
-        gravity: added to gravity [m/s2].
-        station: indices of the stations that forces act on, each once; not batched.
-    """
-
-    force: Float[Any, "*batch row place 3"]
-    stiffness: Float[Any, "*batch row"]
-    damping: Float[Any, "*batch row"]
-    gravity: Float[Any, "*batch row 3"]
-    station: tuple[int, ...]
-
 
 LEAST_TANGENT = 0.1
 """Least tangent stiffness under the fibre law, relative to the linear section's: matrices stay positive definite."""
@@ -131,19 +112,3 @@ def slopes(section: Sections, strain: Float[Array, "6 ..."]) -> Sections:
     return section._replace(
         stretch=section.stretch * (1.0 + axial * softer), bending=section.bending * (1.0 + planar * softer)
     )
-
-
-def loaded(
-    system: System, prepared: Prepared, loads: SectionLoads, row: Any
-) -> tuple[Prepared, Float[Array, "stations 6"]]:
-    """The body under one row of loads, and the forces [N] and moments [N m] on its stations."""
-    force, stiffness, damping, gravity = (jnp.asarray(part)[row] for part in loads[:4])
-    loss = jnp.exp(damping)
-    changed = prepared._replace(
-        firmness=jnp.exp(stiffness),
-        rayleigh_mass=loss * prepared.rayleigh_mass,
-        rayleigh_stiffness=loss * prepared.rayleigh_stiffness,
-        gravity=prepared.gravity + gravity,
-    )
-    pushed = jnp.zeros((len(system.body.station), 6)).at[jnp.asarray(loads.station, dtype=int), :3].set(force)
-    return changed, pushed

@@ -14,7 +14,7 @@ from rfdropo_bayes.mechanisms.sizes import USUAL, half_normal, log_normal, norma
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPOOL = 0.02  # [m], radius of a usual spool, for motors of which no usual command is known
 POWERS = {"m": 1, "m/s": 1, "1/m": -1, "s/m": -1}  # of a length in each unit

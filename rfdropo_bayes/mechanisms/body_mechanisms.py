@@ -17,7 +17,7 @@ from rfdropo_bayes.fem import BendingLaw, Material, Rod, Viscoelasticity, Wall
 from rfdropo_bayes.mechanisms.sizes import half_normal, log_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 AXES = ("x", "y", "z")
 PART = 0.1  # of the length: half the width of a part of the body

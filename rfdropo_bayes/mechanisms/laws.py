@@ -20,8 +20,9 @@ from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
 from rfdropo_bayes.mechanisms.sizes import normal
 from rfdropo_bayes.simulators.commands import sample
 from rfdropo_bayes.simulators.mechanisms import Meanwhile, Mechanism, Values
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.port_signals import BodySignals, read_late
-from rfdropo_bayes.simulators.protocol import ParameterSpec, nearest
+from rfdropo_bayes.tables import nearest
 
 WHERE = "[[model.laws]]"
 FAR = 1e3  # hard bounds of a coefficient, in prior scales from null

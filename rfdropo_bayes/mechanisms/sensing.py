@@ -15,7 +15,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.sizes import half_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 NUMBERED = tuple(str(k + 1) for k in range(4))
 ROUNDING = 1e-30  # [m2] under the square root

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Scales(NamedTuple):

@@ -31,7 +31,8 @@ from rfdropo_bayes.policies.tasks import (
 )
 from rfdropo_bayes.runtime import refuse_lost_threads
 from rfdropo_bayes.simulators.control_session import Session
-from rfdropo_bayes.simulators.protocol import Observation, Result, check_names, check_value
+from rfdropo_bayes.simulators.parameters import check_names, check_value
+from rfdropo_bayes.simulators.protocol import Observation, Result
 
 REDRAWS = 200
 """Number of redraws for a lane whose initial state was not found. Under the uniform ranges of the virtual trunk one

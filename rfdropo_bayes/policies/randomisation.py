@@ -18,7 +18,7 @@ from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
 from rfdropo_bayes.posteriors import PosteriorRecord
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
-from rfdropo_bayes.simulators.protocol import ParameterSpec, check_names, check_value
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value
 
 POSTERIOR, PHI = "posterior.nc", "summary.json"
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, ModelError, recorded_model_error
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class SessionDeviation(NamedTuple):

@@ -25,7 +25,8 @@ from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.extended import ExtendedSimulator, Wound
 from rfdropo_bayes.simulators.finite_differences import LENGTH, with_differences
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, Values, check_mechanisms, code_of, obstacle
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec, Result, specs_of
+from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
+from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import nearest, parse_table
 
 STROKES = {"m": LENGTH, "rad": 0.1, "N": 1.0, "N m": 1.0, "Pa": 1e4, "-": 1.0}

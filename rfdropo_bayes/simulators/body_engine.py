@@ -37,7 +37,7 @@ from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.sections import SectionLoads, loaded
+from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
 from rfdropo_bayes.fem.tetrahedra import NodePoints, TetrahedralMaterial, TetrahedralSystem
 from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.finite_differences import (

@@ -21,7 +21,7 @@ from rfdropo_bayes.fem.pushing import PushGeometry, smallest_gap
 from rfdropo_bayes.fem.rigid_body import Cube
 from rfdropo_bayes.fem.rod import joined
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.sections import loaded
+from rfdropo_bayes.fem.section_loads import loaded
 from rfdropo_bayes.simulators.body_engine import CubeInputs, Engine, cube_arrays
 from rfdropo_bayes.simulators.port_signals import BodySignals
 

@@ -36,8 +36,9 @@ from rfdropo_bayes.simulators.mechanisms import (
     inside_drive,
     settled,
 )
+from rfdropo_bayes.simulators.parameters import check_names, check_value
 from rfdropo_bayes.simulators.port_signals import BodySignals
-from rfdropo_bayes.simulators.protocol import Observation, check_names, check_value
+from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import status_of
 
 WHOLE = 1e-6  # how far a control period may be from a whole number of time steps, in time steps

@@ -24,8 +24,9 @@ from rfdropo_bayes.simulators.mechanisms import (
     inside_drive,
     settled,
 )
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names
 from rfdropo_bayes.simulators.port_signals import reached
-from rfdropo_bayes.simulators.protocol import ParameterSpec, Result, check_names
+from rfdropo_bayes.simulators.protocol import Result
 
 
 class Wound(NamedTuple):

@@ -18,8 +18,8 @@ from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.commands import Commands
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.port_signals import BodySignals
-from rfdropo_bayes.simulators.protocol import ParameterSpec
 
 Values = Mapping[str, Float[Array, ""]]
 

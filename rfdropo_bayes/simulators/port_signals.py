@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 
 class BodySignals(NamedTuple):
-    """Loads on a rod that change from step to step, see `fem.sections`; forces at the engine's stations."""
+    """Loads on a rod that change from step to step, see `fem.section_loads`; forces at the engine's stations."""
 
     force: Float[Array, "*batch row place 3"]  # [N]
     stiffness: Float[Array, "*batch row"]  # logarithm of a factor

@@ -34,8 +34,9 @@ from rfdropo_bayes.simulators.mechanisms import (
     motions_of,
     needs_cables,
 )
+from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.port_signals import BodySignals
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec, Result, specs_of
+from rfdropo_bayes.simulators.protocol import Observation, Result
 
 PASSES = 2
 """Number of fixed-point iterations for laws that depend on the motion: after two, a pull and a softening are within 5 %

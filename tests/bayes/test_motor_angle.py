@@ -31,7 +31,8 @@ from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.mechanisms import Mechanism, inside_drive
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from studies.replicas import simulated_data, with_measured
 

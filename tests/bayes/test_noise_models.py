@@ -22,7 +22,8 @@ from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.residuals import check_residuals, residual_cautions
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation
 from studies.replicas import with_measured
 
 STEP, ROWS, SIGMA = 0.05, 150, 2e-3

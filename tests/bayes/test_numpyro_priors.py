@@ -12,7 +12,7 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.priors import log_density, prior_from_table, table_of
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 WIDE = ParameterSpec("size", "m", -1e3, 1e3, 0.0, {}, "anything")
 TRUNCATED = {"distribution": "TruncatedNormal", "loc": 1.0, "scale": 2.0}

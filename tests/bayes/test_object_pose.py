@@ -21,7 +21,8 @@ from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import SWITCHED
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation
 from studies.replicas import noisy_rollouts, simulated_data, with_measured
 
 STEP = 0.1  # [s]

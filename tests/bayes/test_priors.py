@@ -11,7 +11,7 @@ from scipy import stats
 from rfdropo_bayes.bayes.priors import prior_from_table
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 YOUNG = ParameterSpec("young_modulus", "Pa", 1e6, 5e7, 4.5e6, {}, "stiffness")
 POISSON = ParameterSpec("poisson_ratio", "-", 0.1, 0.499, 0.45, {}, "compressibility")

@@ -17,7 +17,7 @@ from rfdropo_bayes.bayes.scopes import Scopes, build_scopes
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups, group_of, in_group
 from rfdropo_bayes.posteriors import ParameterInfo
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPECS = (
     ParameterSpec(

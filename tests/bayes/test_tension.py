@@ -23,7 +23,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.posteriors import ParameterInfo, Scope
 from rfdropo_bayes.simulators.commands import commands_on_grid
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation
 
 TRUTH = {"stiffness": 240.0, "mass": 0.13}
 

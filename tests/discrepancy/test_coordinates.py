@@ -12,7 +12,7 @@ from rfdropo_bayes.bayes.inferred_parameter import Pooled
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.groups import gather_groups
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPECS = (
     ParameterSpec("modulus", "Pa", 0.0, np.inf, 1.0, {"distribution": "LogNormal", "median": 1.0, "sigma": 0.3}, ""),

@@ -25,7 +25,7 @@ from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.pipeline import Answer, audit
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import Scope
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.between import extend_groups, find_groups, groups_at_hand
 
 from .toys import BASE, Toy, problem, recordings

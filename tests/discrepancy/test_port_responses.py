@@ -26,7 +26,7 @@ from rfdropo_bayes.discrepancy.port_rollouts import PlacedTerm, Scope, coefficie
 from rfdropo_bayes.discrepancy.verdict import SMALL, negligible
 from rfdropo_bayes.mechanisms.features import OWN, Feature
 from rfdropo_bayes.mechanisms.ports import Port, PortMap
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 GROUPS, VALUES, ROWS, STEP = 3, 50, 61, 0.01
 PORTS = tuple(

@@ -16,7 +16,7 @@ from rfdropo_bayes.discrepancy.omnibus import BLOCK
 from rfdropo_bayes.discrepancy.pipeline import Answer, audit
 from rfdropo_bayes.report.audit_page import shown
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.protocol import specs_of
+from rfdropo_bayes.simulators.parameters import specs_of
 
 from .toys import BASE, NOISE, problem, with_prior
 

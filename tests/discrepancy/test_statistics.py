@@ -44,7 +44,7 @@ from rfdropo_bayes.discrepancy.score import (
 )
 from rfdropo_bayes.discrepancy.score_tests import null_residuals, tail
 from rfdropo_bayes.discrepancy.verdict import decide
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 from .toys import measurements
 

@@ -24,7 +24,8 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.extension import Rules
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.simulators.commands import commands_on_grid
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation
 
 STEP = 0.05
 ROWS = 80

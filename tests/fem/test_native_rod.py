@@ -10,7 +10,7 @@ from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.native.rod_engine import NativeRod
 from rfdropo_bayes.fem.native.rod_session import RodSession
-from rfdropo_bayes.fem.sections import SectionLoads
+from rfdropo_bayes.fem.section_loads import SectionLoads
 from tests.fem import native_cases as cases
 from tests.fem import rod_reference
 from tests.fem.native_cases import (

@@ -8,7 +8,7 @@ import pytest
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.native.rod_session import RodSession
-from rfdropo_bayes.fem.sections import SectionLoads
+from rfdropo_bayes.fem.section_loads import SectionLoads
 from tests.fem.native_cases import BATCH, STEPS, all_effects, displacements, engine, materials, rows_of, rubbing
 
 PERIOD, LANES = 2, 11

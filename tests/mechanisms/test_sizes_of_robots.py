@@ -8,7 +8,7 @@ from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.mechanisms.sizes import POWERS, USUAL, Scales, scales_of, sized
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import obstacle
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 RATIOS = Scales(pull=3.0, length=3.0, mass=7.0, force=5.0)
 

@@ -40,7 +40,8 @@ from rfdropo_bayes.policies.tasks import (
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.protocol import ParameterSpec, Result
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Result
 
 REACH = "TrunkReach-v0"
 SPECS = (

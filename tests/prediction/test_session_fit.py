@@ -13,7 +13,7 @@ from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.prediction.model_error import model_error
 from rfdropo_bayes.prediction.session_fit import fit_session
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SPREAD, SIGMA, ROWS = 0.7, 0.5, 6
 

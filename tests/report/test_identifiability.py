@@ -10,7 +10,7 @@ from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.report.identifiability import identify, product_in_words, spread_in_words
 from rfdropo_bayes.report.summary import bound_reached, posterior_table
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 LOG = {"distribution": "LogNormal"}
 

@@ -8,7 +8,7 @@ import pytest
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.native.rod_engine import NativeRod
-from rfdropo_bayes.fem.sections import SectionLoads
+from rfdropo_bayes.fem.section_loads import SectionLoads
 from rfdropo_bayes.robots import Cone, Cylinder, Disks, Robot, Tube, known_robots, section_profile
 
 L, R, TIP = 0.2, 0.014, 0.009

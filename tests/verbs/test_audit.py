@@ -14,7 +14,7 @@ from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.differences import Groups, with_differences
 from rfdropo_bayes.mechanisms import REGISTRY
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.audit import extended_tables, sized_priors
 
 

@@ -20,7 +20,7 @@ ROBOT = Robot.load("trunk_sofa_mesh")
 OWN = """
 import jax.numpy as jnp
 
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Glue:

@@ -33,7 +33,7 @@ from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError
 from rfdropo_bayes.prediction.predictive import NOISE, draw_extended
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.verbs.simulate import simulate_all
 
 FITTED_WITH = {INTEGRATOR: "sdirk2"}

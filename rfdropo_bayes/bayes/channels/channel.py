@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import Observation, ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Observation
 
 
 class Seen(NamedTuple):

@@ -29,7 +29,7 @@ from rfdropo_bayes.bayes.noise import (
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.recordings import RecordingSet
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 @dataclass(frozen=True, kw_only=True)

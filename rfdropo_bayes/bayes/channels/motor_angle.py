@@ -16,7 +16,7 @@ from jaxtyping import Float
 from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries, padded_readings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 MOTOR_ANGLE_NOISE = ParameterSpec(
     "motor_angle_noise",

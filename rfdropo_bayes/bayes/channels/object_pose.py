@@ -24,7 +24,7 @@ from rfdropo_bayes.bayes.noise import Autoregression, Noise, Timeline, draw_nois
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 OFFSETS = ("offset_x", "offset_y", "offset_z")  # parameters that shift measured against simulated positions [m]
 

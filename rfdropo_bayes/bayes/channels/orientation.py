@@ -14,7 +14,7 @@ from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries
 from rfdropo_bayes.bayes.channels.object_pose import of_rotation_vector, product, turn_between
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 ORIENTATION_NOISE = ParameterSpec(
     "orientation_noise",

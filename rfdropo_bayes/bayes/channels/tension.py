@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float, Int
 from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries, padded_readings
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.protocol import ParameterSpec, Simulator
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.simulators.protocol import Simulator
 
 TENSION_NOISE = ParameterSpec(
     "tension_noise",

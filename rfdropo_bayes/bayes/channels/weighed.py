@@ -18,7 +18,7 @@ from rfdropo_bayes.bayes.channels.channel import Channel, Seen
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import whole
 from rfdropo_bayes.posteriors import ParameterInfo, label
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 
 class Weighed(NamedTuple):

@@ -14,7 +14,7 @@ from rfdropo_bayes.fem.integrators import Stage
 from rfdropo_bayes.fem.native import rod_effects as at
 from rfdropo_bayes.fem.native.rod_tables import section_areas
 from rfdropo_bayes.fem.rod import Rod
-from rfdropo_bayes.fem.sections import SectionLoads
+from rfdropo_bayes.fem.section_loads import SectionLoads
 
 
 def _each(function: Callable[[float], float], values: ArrayLike, count: int) -> Float[np.ndarray, " batch"]:

@@ -17,7 +17,7 @@ from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
 """Flags in ``samples.present``; the last is Coulomb's friction, followed by the capstan's."""
 LOADED = FRICTION + 2
-"""Flag of loads that change from step to step, see ``fem.sections``."""
+"""Flag of loads that change from step to step, see ``fem.section_loads``."""
 FLAGS = LOADED + 1
 (
     GAIN, SHARE, DECAY, LATER_DECAY, DRAG, WALL, DISTANCE, NORMAL_X, NORMAL_Y, GIVE, COULOMB, CAPSTAN, FIBRE,

@@ -49,7 +49,7 @@ from rfdropo_bayes.fem.native.simd import lane_token, native_lanes
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rod import PointMap
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.sections import SectionLoads
+from rfdropo_bayes.fem.section_loads import SectionLoads
 from rfdropo_bayes.runtime import available_processors
 
 Precision = Literal["float64", "float32"]

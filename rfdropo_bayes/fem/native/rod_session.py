@@ -26,7 +26,7 @@ from rfdropo_bayes.fem.native.rod_records import RodSamples
 from rfdropo_bayes.fem.native.rod_tables import as_kernel_array
 from rfdropo_bayes.fem.native.simd import aligned_zeros
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.sections import SectionLoads
+from rfdropo_bayes.fem.section_loads import SectionLoads
 
 KEPT = {
     "samples": tuple(name for name in RodSamples._fields if name != "present"),

@@ -10,7 +10,7 @@ from rfdropo_bayes.bayes.inferred_parameter import Pooled
 from rfdropo_bayes.bayes.problem import ProblemDefaults
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.inference.smc.moves import Reference, StraightProblem, distinct_size, fit_reference, propose
-from rfdropo_bayes.simulators.protocol import ParameterSpec
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 SIZES = np.array([1e-9, 1.0, 1e6])
 
