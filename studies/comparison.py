@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.posteriors import central_interval
+from studies.replicas import simulated_data, with_measured
 from studies.virtual_tasks import TASKS, InferenceTask, draw_truth, excited, task_problem
 
 WIDTH = 4.0  # the paper's error is measured with every search range scaled to [0, 4]
@@ -55,9 +55,9 @@ def fit(job: Mapping[str, Any]) -> dict[str, Any]:
     else:
         return {"failed": f"none of {ANEW} truths has a rollout that ends well", "truth": truth}
     if job["row"] == "ours + tension":
-        replica = with_tension.with_measured(measured)
+        replica = with_measured(with_tension, measured)
     else:
-        replica = problem.with_measured({name: measured[name] for name in problem.measured})
+        replica = with_measured(problem, {name: measured[name] for name in problem.measured})
     began = time.monotonic()
     try:
         draws, spent = infer(job, replica, fit_key)

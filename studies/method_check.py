@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json
 from rfdropo_bayes.inference.methods import make_config
@@ -19,6 +18,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import LOG, hashes, run_folder
 from rfdropo_bayes.verbs.calibrate import inference_options
 from studies import sbc
+from studies.replicas import simulated_data, with_measured
 
 MOST_FAILURES = 100
 
@@ -75,7 +75,7 @@ def simulate_data_set(
         truth = {name: float(np.asarray(column)[0]) for name, column in problem.sample_prior(truth_key, 1).items()}
         measured = simulated_data(problem, truth, noise_key)
         if measured is not None:
-            return truth, problem.with_measured(measured), failed
+            return truth, with_measured(problem, measured), failed
     raise InputError(
         f"none of {MOST_FAILURES} prior draws gives a rollout that ends well",
         where="[model.priors]",

@@ -31,6 +31,7 @@ from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.smc.moves import host_generator
+from studies.replicas import actions, noisy_rollouts
 
 FEWEST_ROLLOUTS = 50
 
@@ -189,7 +190,7 @@ def simulate(
 ) -> Simulations:
     """Roll out parameter sets and put observation noise on them."""
     values = problem.from_unconstrained(jnp.asarray(prior.unconstrained(theta)))
-    features, status = problem.noisy_rollouts(key, values)
+    features, status = noisy_rollouts(problem, key, values)
     features, status = np.asarray(features, dtype=float), np.asarray(status)
     ledger.charge(problem, len(theta), problem.n_rows)
     broken = np.logical_not(np.isfinite(features).all(axis=(1, 2)))
@@ -214,7 +215,7 @@ def run_bayessim(
     simulated = with_rollouts(problem)
 
     def summarise(features: np.ndarray) -> np.ndarray:
-        return cross_correlation_summary(features, np.asarray(simulated.actions))
+        return cross_correlation_summary(features, actions(simulated))
 
     return _run(simulated, "bayessim", config, key, summarise, rounds=1, logbook=logbook)
 
@@ -326,7 +327,7 @@ def run_udr(problem: Problem, config: UdrConfig, key: PRNGKeyArray, logbook: Log
 
 
 def cross_correlation_summary(
-    features: Float[np.ndarray, "n time f"], actions: Float[np.ndarray, "time a"]
+    features: Float[np.ndarray, "n time f"], commands: Float[np.ndarray, "time a"]
 ) -> Float[np.ndarray, "n s"]:
     """BayesSim's: correlation of state changes with actions, and mean and deviation of the state changes.
 
@@ -334,7 +335,7 @@ def cross_correlation_summary(
     differences.
     """
     change = np.diff(features, axis=1)
-    action = actions[: change.shape[1]]
+    action = commands[: change.shape[1]]
     products = np.einsum("ntf,ta->nfa", change, action) / len(action)
     parts = (products.reshape(len(features), -1), change.mean(axis=1), change.std(axis=1))
     return np.concatenate(parts, axis=1)

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
-from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, Series
+from rfdropo_bayes.bayes.lanes import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
 from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -139,13 +139,6 @@ class CalibrationProblem:
         """The same problem, which reports rollouts in full-length equivalents to ``spent``."""
         return replace(self, count_rollouts=spent)
 
-    def with_measured(self, measured: Measured) -> CalibrationProblem:
-        """The same problem with other data.
-
-        Its Jacobians are central differences of compiled rollouts, because a derivative would be compiled anew.
-        """
-        return replace(self, other=measured, jacobian="central")
-
     def counting(self, shares: Mapping[str, float]) -> CalibrationProblem:
         """The same problem with the log likelihood of some channels times a share."""
         return replace(self, counted={**self.counted, **shares})
@@ -223,31 +216,11 @@ class CalibrationProblem:
         features, status = self._chunked(values, horizon, self.model.programs.features)
         return self._side_by_side(features)[:, :horizon], status
 
-    def noisy_rollouts(
-        self, key: PRNGKeyArray, values: Batch
-    ) -> tuple[Float[np.ndarray, "n n_rows feature"], Int[np.ndarray, " n"]]:
-        """`rollouts` of all rows with a realisation of the observation noise [m]."""
-        clean, status = self.rollouts(values, self.n_rows)
-        noise = [
-            self._realised(channel.draw_features, jax.random.fold_in(key, index) if index else key, values)
-            for index, channel in enumerate(self.model.compared)
-        ]
-        return clean + self._side_by_side(np.concatenate(noise, axis=-1)), status
-
     def noise_deviation(self, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
         """Standard deviation of the observation noise [m] of each feature, laid out like `rollouts`, at one set of
         values."""
         known = {**self.model.scopes.fixed, **values}
         return np.tile(np.concatenate([c.feature_deviation(known) for c in self.model.compared]), self.n_recordings)
-
-    @cached_property
-    def actions(self) -> Float[np.ndarray, "n_rows channel"]:
-        """Commands in force at each row, of all recordings side by side."""
-        commands = self.model.recordings.commands
-        initial = np.asarray(commands.initial)[:, None]
-        level = np.concatenate([initial, np.asarray(commands.step)], axis=1)
-        index = np.minimum(np.asarray(commands.sample_step), level.shape[1] - 1)
-        return np.concatenate([steps[rows] for steps, rows in zip(level, index, strict=True)], axis=1)
 
     @cached_property
     def observed(self) -> Float[np.ndarray, "n_rows feature"]:
@@ -330,15 +303,11 @@ class CalibrationProblem:
 
     def draw_noise(self, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time marker 3"]:
         """A realisation of the observation noise [m] for every set of values."""
-        return self._realised(self.model.markers.draw_noise, key, values)
-
-    def _realised(self, draw: Callable, key: PRNGKeyArray, values: Batch) -> Float[np.ndarray, "n recording time ..."]:
-        """Results of ``draw`` for a key, the times of a recording and a set of values, for all recordings and sets."""
+        time, draw = jnp.asarray(self.model.recordings.time), self.model.markers.draw_noise
 
         def of_all(key: PRNGKeyArray, values: Mapping[str, Array]) -> Array:
-            keys = jax.random.split(key, self.n_recordings)
             known = {**self.model.scopes.fixed, **values}
-            return jax.vmap(lambda k, t: draw(k, t, known))(keys, jnp.asarray(self.model.recordings.time))
+            return jax.vmap(lambda k, t: draw(k, t, known))(jax.random.split(key, self.n_recordings), time)
 
         inferred = {name: jnp.asarray(values[name]) for name in self.names}
         count = len(next(iter(inferred.values())))

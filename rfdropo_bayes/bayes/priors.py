@@ -20,7 +20,8 @@ from scipy import stats
 from scipy.special import ndtr
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
+from rfdropo_bayes.simulators.parameters import ParameterSpec
+from rfdropo_bayes.tables import nearest
 
 # The arguments are checked below; a value that rounding puts a hair outside the support needs no warning.
 UNCHECKED = {"validate_args": False}

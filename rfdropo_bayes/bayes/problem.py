@@ -8,7 +8,7 @@ behind it.
 | `TraceableProblem` | NUTS, nested sampling |
 | `WarmStart` | optimisations from an earlier posterior |
 | `Hierarchy` | optimisations with standard deviations among the parameters |
-| `RolloutProblem` | RF-DROPO, and methods that learn from simulations |
+| `RolloutProblem` | RF-DROPO |
 
 All members of a protocol are required. `ProblemDefaults` and `RolloutDefaults` have the members with usual defaults.
 """
@@ -200,7 +200,6 @@ class RolloutProblem(Problem, Protocol):
             prior median.
         observed: measured features, laid out like `rollouts`.
         observed_mask: True for usable entries of ``observed``.
-        actions: commands at the rows; (n_rows, 0) without commands.
     """
 
     @property
@@ -212,17 +211,8 @@ class RolloutProblem(Problem, Protocol):
     @property
     def observed_mask(self) -> Bool[Any, "n_rows feature"]: ...
 
-    @property
-    def actions(self) -> Float[Any, "n_rows action"]: ...
-
     def rollouts(self, values: Values, horizon: int) -> tuple[Float[Any, "n horizon feature"], Int[Any, " n"]]:
         """Simulated features of the first ``horizon`` rows, without observation noise, and the status of each."""
-        ...
-
-    def noisy_rollouts(
-        self, key: PRNGKeyArray, values: Values
-    ) -> tuple[Float[Any, "n n_rows feature"], Int[Any, " n"]]:
-        """`rollouts` of all rows, with observation noise."""
         ...
 
     def noise_deviation(self, values: Mapping[str, float]) -> Float[Any, " feature"]:
@@ -263,18 +253,7 @@ class ProblemDefaults:
 
 
 class RolloutDefaults(ProblemDefaults):
-    """The same of a problem with rollouts: neither noise nor commands."""
-
-    @cached_property
-    def actions(self: Any) -> Float[np.ndarray, "n_rows 0"]:
-        """None."""
-        return np.zeros((self.n_rows, 0))
-
-    def noisy_rollouts(
-        self: Any, key: PRNGKeyArray, values: Values
-    ) -> tuple[Float[Any, "n n_rows feature"], Int[Any, " n"]]:
-        """The rollouts unchanged."""
-        return self.rollouts(values, self.n_rows)
+    """The same of a problem with rollouts: no noise."""
 
     def noise_deviation(self: Any, values: Mapping[str, float]) -> Float[np.ndarray, " feature"]:
         """Zero."""

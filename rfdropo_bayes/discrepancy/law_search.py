@@ -129,7 +129,6 @@ class LawResult:
             lead-in times, from their median.
         null_quantile: null quantile of the first term's gain on left-out recordings [nat]; None if no port is
         significant.
-        offered: largest gain [nat] of any feature at any port before the first term; 0 without any gain.
     """
 
     map: PortMap
@@ -139,7 +138,6 @@ class LawResult:
     afterwards: list[PortEvidence]
     centre: Float[np.ndarray, " spline"]
     null_quantile: float | None
-    offered: float
 
     @property
     def last(self) -> Refit | None:
@@ -325,14 +323,13 @@ class LawSearch:
         null = self._null(known, fit, linear)
         where = evidences(linear, null)
         centre = linear.basis.centre - linear.begun
-        law = LawResult(self.ports, where, [], [], [], centre, None, 0.0)
+        law = LawResult(self.ports, where, [], [], [], centre, None)
         yield law
         try:
             while len(law.terms) != self.most and (where[0].adjusted_p <= self.family or (forced and not law.terms)):
                 terms = law.terms
                 if not terms:
                     linear = self._sharpened(known, fit, linear, values, where)
-                    law = replace(law, offered=next((row.gain for row in self._ranked(linear, values, 0.0)), 0.0))
                 null_quantile = self._null_quantile(linear, values, null)
                 law = law if terms else replace(law, null_quantile=null_quantile)
                 ranked = self._ranked(linear, values, null_quantile, terms=terms)

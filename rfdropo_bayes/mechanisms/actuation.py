@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
-from rfdropo_bayes.mechanisms.sizes import USUAL, scaled
+from rfdropo_bayes.mechanisms.sizes import USUAL, half_normal, log_normal, normal, scaled
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values

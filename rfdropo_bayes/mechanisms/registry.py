@@ -23,7 +23,7 @@ from rfdropo_bayes.mechanisms.sizes import scales_of, sized
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.mechanisms import Mechanism
-from rfdropo_bayes.simulators.parameters import nearest
+from rfdropo_bayes.tables import nearest
 
 MODULES = (actuation, body_mechanisms, sensing)
 DRIFTING = (

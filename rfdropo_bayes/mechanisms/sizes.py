@@ -77,3 +77,18 @@ def sized(spec: ParameterSpec, scales: Scales) -> ParameterSpec:
     made = scaled(spec, float(np.prod(ratios ** np.array(powers))))
     # Bounds are limits of the physics, and never narrower than those of the usual trunk.
     return made._replace(low=min(made.low, spec.low), high=max(made.high, spec.high))
+
+
+def normal(scale: float, loc: float = 0.0) -> dict[str, Any]:
+    """Normal prior of an effect of either sign."""
+    return {"distribution": "Normal", "loc": loc, "scale": scale}
+
+
+def half_normal(scale: float) -> dict[str, Any]:
+    """Half-normal prior of an effect that cannot be negative."""
+    return {"distribution": "HalfNormal", "scale": scale}
+
+
+def log_normal(median: float, sigma: float) -> dict[str, Any]:
+    """Log-normal prior of a time that is known to a factor of exp(sigma)."""
+    return {"distribution": "LogNormal", "median": median, "sigma": sigma}

@@ -55,9 +55,10 @@ from rfdropo_bayes.simulators.black_box import BlackBox, BlackBoxSimulator
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC, Backend, Engine
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.simulators.mesh_body import MeshTrunkSimulator, assemble_mesh
-from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, nearest, specs_of
+from rfdropo_bayes.simulators.parameters import ParameterSpec, check_names, check_value, specs_of
 from rfdropo_bayes.simulators.robot_simulator import DAMPING, RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+from rfdropo_bayes.tables import nearest
 
 Entry = TypeVar("Entry")
 AnySimulator = RobotSimulator | BlackBoxSimulator

@@ -20,12 +20,10 @@ ROBOT_COPY = "robot.toml"
 MODEL_FILES = (".toml", ".xml", ".urdf")
 FILE_KEYS = ("observations", "commands")
 NO_COMMANDS = "none"  # zero commands instead of a file of commands
-WRITTEN_BY_RUNS = ("config.toml", "extended.toml")
-RESULTS_OF_RUNS = ("run.json", "summary.json", "audit.json")
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Tables of a TOML file. A file written by a run states its integrator; without this key it is read as ``"euler"``.
+    """Tables of a TOML file.
 
     Raises:
         InputError: no such file, or not TOML.
@@ -39,14 +37,9 @@ def read_tables(path: Path) -> dict[str, Any]:
             f"cannot read the experiment file: {reason}", where=str(path), remedy="check the path"
         ) from None
     try:
-        tables = read_toml(text)
+        return read_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"not valid TOML: {error}", where=str(path), remedy="correct the syntax there") from None
-    if path.name in WRITTEN_BY_RUNS and any((path.parent / name).is_file() for name in RESULTS_OF_RUNS):
-        stated = tables.setdefault("simulator", {})
-        if isinstance(stated, dict) and "motion" not in stated:
-            stated.setdefault("integrator", "euler")
-    return tables
 
 
 def override(tables: dict[str, Any], assignment: str, fields: Container[str]) -> None:

@@ -22,29 +22,28 @@ def stated_integrator(spec: ModelSpec) -> dict[str, str]:
     return {} if integrator is None else {INTEGRATOR: integrator}
 
 
-def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None) -> str:
-    """Integrator of a fit.
+def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None) -> str | None:
+    """Integrator of a fit; None if neither states it.
 
     Args:
         attributes: attributes of the posterior.
-        folder: folder of the run; config.toml is used if the attributes lack the integrator, and "euler" if both lack
-        it.
+        folder: folder of the run; its config.toml is used if the attributes lack the integrator.
     """
     if INTEGRATOR in attributes:
         return str(attributes[INTEGRATOR])
     if folder is None or not (folder / CONFIG).is_file():
-        return "euler"
+        return None
     simulator = read_tables(folder / CONFIG).get("simulator", {})
-    return QUASI_STATIC if simulator.get("motion") == QUASI_STATIC else str(simulator.get(INTEGRATOR, "euler"))
+    return QUASI_STATIC if simulator.get("motion") == QUASI_STATIC else simulator.get(INTEGRATOR)
 
 
-def check_fitted_integrator(fitted: str, integrator: str | None, *, where: str) -> None:
-    """Check that a model uses the integrator of the fit whose posterior it uses; None stands for a black box.
+def check_fitted_integrator(fitted: str | None, integrator: str | None, *, where: str) -> None:
+    """Check that a model uses the integrator of the fit whose posterior it uses; None is unknown, or a black box.
 
     Raises:
         InputError: it does not.
     """
-    if integrator is not None and integrator != fitted:
+    if None not in (fitted, integrator) and integrator != fitted:
         key = "motion" if fitted == QUASI_STATIC else "integrator"
         raise InputError(
             f"the parameters were fitted with {key} {fitted!r}, and are to be used with {integrator!r}",

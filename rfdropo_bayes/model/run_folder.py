@@ -34,8 +34,6 @@ FREE_TO_CHANGE = (
 
 
 MOVABLE = ("experiment.data.fit", "experiment.data.test")
-# Default of settings that a run's file does not state.
-MEANT_EARLIER = {"experiment.simulator.integrator": "euler"}
 
 
 class RunKind(NamedTuple):
@@ -267,7 +265,6 @@ def _check_settings(out: Path, before: Mapping[str, Any], now: Mapping[str, Any]
         for tables, name in product((old, new), MOVABLE):
             if name in tables:
                 tables[name] = [_without_folders(entry) for entry in tables[name]]
-    old = {name: value for name, value in MEANT_EARLIER.items() if name in new} | old
     differing = [name for name in {**old, **new} if name not in FREE_TO_CHANGE and old.get(name) != new.get(name)]
     if not differing:
         return

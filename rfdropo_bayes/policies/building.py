@@ -6,15 +6,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from gymnasium import spaces
+
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.policies.episodes import Episodes, Settings
 from rfdropo_bayes.policies.randomisation import Point, Randomisation
 from rfdropo_bayes.policies.tasks import task_named
 from rfdropo_bayes.robots import Robot
+from rfdropo_bayes.robots.policy_layout import PolicyLayout
 from rfdropo_bayes.simulators.body_engine import Backend, Engine, Integrator
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.simulators.trunk import Discretisation, TrunkSimulator, assemble
+
+FAR = 1e3  # bound above all observed values, in SI units; Gymnasium requires bounds
 
 
 def trunk_simulator(
@@ -93,3 +99,11 @@ def make_episodes(
         if name not in known:
             raise InputError(f"unknown setting {name!r}", where=task, remedy=f"use one of {', '.join(sorted(known))}")
     return Episodes(simulator, chosen, lanes, randomisation or Point(parameters or {}), Settings(**settings))
+
+
+def spaces_of(layout: PolicyLayout) -> tuple[spaces.Box, spaces.Space]:
+    """Observation and action space."""
+    observed = spaces.Box(-FAR, FAR, (layout.size,), np.float32)
+    if layout.kind == "discrete":
+        return observed, spaces.Discrete(len(layout.moves))
+    return observed, spaces.Box(-1.0, 1.0, (len(layout.channels),), np.float32)

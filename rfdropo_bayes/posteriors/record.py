@@ -14,7 +14,6 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import (
     InferenceData,
     in_arviz,
@@ -23,7 +22,7 @@ from rfdropo_bayes.posteriors.inference_data import (
     to_tree,
     variable_key,
 )
-from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, Scope
+from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, ProductOfPowers, Scope, evaluate_products
 
 AXES = ("x", "y", "z")
 DRAWS = "draws"  # attribute of a prediction: how many draws are its own

@@ -36,8 +36,7 @@ from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction, Scope
 from rfdropo_bayes.prediction.first_row import first_row_distances, match_first_row, resampled_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
-from rfdropo_bayes.prediction.session_deviation import draw_deviation
-from rfdropo_bayes.prediction.session_error import SessionError
+from rfdropo_bayes.prediction.session_error import SessionError, draw_deviation
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 

@@ -1,24 +1,56 @@
-"""The predictors a sceptic would use instead of a simulator: a held pose, a copied mean, repeats, a regression on the
-commands.
+"""The predictors a sceptic would use instead of a simulator: a held pose, a copy of repeats or of earlier sessions, a
+regression on the commands.
 
 They use no model of the robot. A calibrated simulator that does not beat them has not earned its keep.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from rfdropo_bayes.data import Trajectory, command_openings, group_repeats, same_opening
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.report.fir import FirRegression, fit_fir
-from rfdropo_bayes.report.scores import ErrorFigures, measured_paths, score
+from rfdropo_bayes.report.scores import ErrorFigures, MeasuredPath, measured_paths, score
+
+SPANS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # history that is looked at [s]
+LAGS = 11  # at most, evenly spaced over the span
+PENALTIES = 10.0 ** np.arange(-6.0, 1.5, 1.0)  # per row, of standardised features
+BLOCKS = 5
+
+
+@dataclass(frozen=True)
+class FirRegression:
+    """A trained regression."""
+
+    lags: Float[np.ndarray, " lag"]  # ages of its input commands [s]
+    degree: int  # highest power of a command
+    # low, high: range of each feature in training; features are cut there, so that powers do not run away
+    low: Float[np.ndarray, " feature"]
+    high: Float[np.ndarray, " feature"]
+    # centre, scale: constants that standardise the features
+    centre: Float[np.ndarray, " feature"]
+    scale: Float[np.ndarray, " feature"]
+    offset: Float[np.ndarray, "marker 3"]  # mean pose
+    weights: Float[np.ndarray, "marker feature 3"]  # weights of the standardised features
+    penalty: float  # ridge penalty per row
+    error: float  # cross-validated root mean square distance, all markers [m]
+
+    def predict(self, recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
+        """Positions [m] from the commands alone."""
+        features = np.clip(_features(recording, self.lags, self.degree), self.low, self.high)
+        standard = (features - self.centre) / self.scale
+        return self.offset + np.moveaxis(standard @ self.weights, 0, 1)
+
 
 Predictor = Callable[[Trajectory], Float[np.ndarray, "time marker 3"]]
+Predictors = Mapping[str, tuple[str, str, Predictor]]
+"""Title, description and predictor, by name."""
+Openings = Mapping[str, Mapping[str, str]]
 
 
 @dataclass(frozen=True)
@@ -34,11 +66,11 @@ class BaselineErrors:
     reason: str = ""  # why it could not predict; empty if it could
 
 
-def held_initial_pose(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-    """The first usable position of each marker, held constant."""
-    first = np.argmax(recording.position_mask, axis=0)
-    pose = recording.position[first, np.arange(recording.position.shape[1])]
-    return np.broadcast_to(pose, recording.position.shape)
+def held_pose(shown: Trajectory) -> Predictor:
+    """The first usable position of each marker of a recording, held constant."""
+    first = np.argmax(shown.position_mask, axis=0)
+    pose = shown.position[first, np.arange(shown.position.shape[1])]
+    return lambda recording: np.broadcast_to(pose, recording.position.shape)
 
 
 def mean_pose(fit: Sequence[Trajectory]) -> Predictor:
@@ -49,74 +81,89 @@ def mean_pose(fit: Sequence[Trajectory]) -> Predictor:
     return lambda recording: np.broadcast_to(pose, recording.position.shape)
 
 
-def copied_mean(fit: Sequence[Trajectory]) -> Predictor:
-    """The mean of the fit recordings at the same time after the start, for any command.
+def repeated_mean(earlier: Sequence[MeasuredPath], openings: Openings) -> Predictor:
+    """The mean of other recordings of the same commands at the same time; their last pose is held after their end.
 
-    A fit recording is predicted by the others. The predictor raises InputError if no other recording lasts as long.
+    The predictor raises InputError if no other recording has the commands, or none of these shows a marker.
+
+    Args:
+        earlier: recordings to copy.
+        openings: first commands of each, by name, see `command_openings`.
     """
 
     def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-        others = [source for source in fit if source.sha256 != recording.sha256 or source.name != recording.name]
-        total = np.zeros(recording.position.shape)
-        count = np.zeros(recording.position.shape[:2])
-        for source in others:
-            within = recording.time <= source.time[-1] + _tolerance(source)
-            for marker in range(recording.position.shape[1]):
-                usable = source.position_mask[:, marker]
-                if usable.any():
-                    path, time = source.position[usable, marker], source.time[usable]
-                    for axis in range(3):
-                        total[:, marker, axis] += within * np.interp(recording.time, time, path[:, axis])
-                    count[:, marker] += within
-        if not count.all():
-            raise InputError(
-                f"no other fitted recording lasts {recording.time[-1]:.4g} s, as this recording does",
-                where=recording.name,
-            )
-        return total / count[..., None]
-
-    return predict
-
-
-def repeated_mean(fit: Sequence[Trajectory]) -> Predictor:
-    """The mean of the fitted repeats of the same commands at the same time; their last pose is held after their end.
-
-    The predictor raises InputError if no other fit recording has the commands.
-    """
-    openings = [command_openings(source) for source in fit]
-
-    def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
-        own = command_openings(recording)
-        repeats = [
-            source
-            for source, begun in zip(fit, openings, strict=True)
-            if same_opening(own, begun) and (source.sha256 != recording.sha256 or source.name != recording.name)
-        ]
-        if not repeats:
+        own, mean = command_openings(recording), np.zeros(recording.position.shape)
+        alike = [p for p in earlier if p.name != recording.name and same_opening(own, openings.get(p.name, {}))]
+        if not alike:
             raise InputError("no other fitted recording has the same commands", where=recording.name)
-        total, count = np.zeros(recording.position.shape), np.zeros(recording.position.shape[1])
-        for source in repeats:
-            for marker in np.flatnonzero(source.position_mask.any(axis=0)):
-                usable = source.position_mask[:, marker]
-                path, time = source.position[usable, marker], source.time[usable]
-                total[:, marker] += np.stack([np.interp(recording.time, time, path[:, i]) for i in range(3)], axis=-1)
-                count[marker] += 1
-        if not count.all():
-            raise InputError("a marker was lost in all fitted recordings with the same commands", where=recording.name)
-        return total / count[:, None]
+        for column, marker in enumerate(recording.marker_names):
+            seen = [p for p in alike if marker in p.marker_names and p.mask[:, p.marker_names.index(marker)].any()]
+            if not seen:
+                what = f"{marker} was lost in all fitted recordings with the same commands"
+                raise InputError(what, where=recording.name)
+            for path in seen:
+                index = path.marker_names.index(marker)
+                time, position = path.time[path.mask[:, index]], path.position[path.mask[:, index], index]
+                mean[:, column] += np.stack([np.interp(recording.time, time, axis) for axis in position.T], axis=-1)
+            mean[:, column] /= len(seen)
+        return mean
 
     return predict
+
+
+def scaled_copy(shown: Trajectory, copied: Predictor) -> Predictor:
+    """A copy, with a scale and a shift of each marker by least squares on the known part of the session."""
+
+    def predict(recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
+        copy, scaled = copied(shown), copied(recording)
+        for marker in range(scaled.shape[1]):
+            rows = shown.position_mask[:, marker]
+            there, here = copy[rows, marker], shown.position[rows, marker]
+            middle, about = there.mean(axis=0), here.mean(axis=0)
+            power = float(np.sum((there - middle) ** 2))
+            scale = float(np.sum((there - middle) * (here - about))) / power if power > 0.0 else 1.0
+            scaled[:, marker] = about + scale * (scaled[:, marker] - middle)
+        return scaled
+
+    return predict
+
+
+def session_baselines(
+    shown: Trajectory, tested: Sequence[Trajectory], earlier: Sequence[MeasuredPath], openings: Openings
+) -> dict[str, BaselineErrors]:
+    """Errors of predictions of a session without a model.
+
+    Args:
+        shown: the known part of the session.
+        tested: the predicted part.
+        earlier: fitted recordings.
+        openings: first commands of each, see `command_openings`.
+    """
+    copied = repeated_mean(earlier, openings)
+    predictors: Predictors = {
+        "first_row": (
+            "first row of the session held",
+            "the first known pose of the session, held constant",
+            held_pose(shown),
+        ),
+        "copied": (
+            "earlier sessions copied",
+            "mean of the fitted recordings of the same commands at the same time",
+            copied,
+        ),
+        "scaled_copy": (
+            "earlier sessions copied and scaled",
+            "the same copy, with a scale and a shift of each marker fitted to the known part of the session",
+            scaled_copy(shown, copied),
+        ),
+    }
+    return _scored(predictors, [shown], tested)
 
 
 def with_fitted_commands(fit: Sequence[Trajectory], test: Sequence[Trajectory]) -> list[str]:
     """Names of the test recordings whose commands were also fitted, in the same or another recording."""
     openings = [command_openings(source) for source in fit]
     return [t.name for t in test if any(same_opening(command_openings(t), begun) for begun in openings)]
-
-
-def _tolerance(recording: Trajectory) -> float:
-    """Repeats end a little apart, with the jitter of their clocks."""
-    return 2.0 * sample_time(recording.time)
 
 
 def baseline_errors(
@@ -140,26 +187,23 @@ def baseline_errors(
     trained_on = f"{seconds:.4g} s in {len(fit)} recording{'s' if len(fit) != 1 else ''}"
     groups = [list(group) for group in group_repeats(fit)]
     linear, cubic = fit_fir(fit, groups, degree=1), fit_fir(fit, groups, degree=3)
-    predictors: dict[str, tuple[str, str, Predictor]] = {
-        "initial_pose": ("initial pose held", "each recording's own first pose, held constant", held_initial_pose),
-        "mean_pose": ("constant mean pose", f"mean pose of the fit recordings ({trained_on})", mean_pose(fit)),
-        "copied_mean": (
-            "fit mean copied",
-            f"mean of the fit recordings ({trained_on}) at the same time, whatever is commanded",
-            copied_mean(fit),
+    repeated = repeated_mean(measured_paths(fit), {t.name: command_openings(t) for t in fit})
+    predictors: Predictors = {
+        "initial_pose": (
+            "initial pose held",
+            "each recording's own first pose, held constant",
+            lambda recording: held_pose(recording)(recording),
         ),
+        "mean_pose": ("constant mean pose", f"mean pose of the fit recordings ({trained_on})", mean_pose(fit)),
         "repeated_mean": (
             "mean of fitted repeats",
             "mean of the fit recordings of the same commands at the same time",
-            repeated_mean(fit),
+            repeated,
         ),
         "fir_linear": ("linear FIR", _describe(linear, trained_on), linear.predict),
         "fir_cubic": ("cubic FIR", _describe(cubic, trained_on), cubic.predict),
     }
-    return {
-        name: scored(name, title, description, predict, fit, test)
-        for name, (title, description, predict) in predictors.items()
-    }
+    return _scored(predictors, fit, test)
 
 
 def _with_markers(recording: Trajectory, markers: Sequence[str]) -> Trajectory:
@@ -178,16 +222,117 @@ def _describe(fir: FirRegression, trained_on: str) -> str:
     )
 
 
-def scored(
-    name: str, title: str, description: str, predict: Predictor, fit: Sequence[Trajectory], test: Sequence[Trajectory]
-) -> BaselineErrors:
-    """Errors of a predictor on the fitted and the test recordings, or the reason if it cannot predict."""
-    figures: list[ErrorFigures | None] = []
-    reason = ""
-    for recordings in (fit, test):
-        try:
-            figures.append(score({t.name: predict(t) for t in recordings}, measured_paths(recordings)))
-        except InputError as error:
-            figures.append(None)
-            reason = str(error)
-    return BaselineErrors(name, title, description, figures[0], figures[1], reason)
+def _scored(predictors: Predictors, fit: Sequence[Trajectory], test: Sequence[Trajectory]) -> dict[str, BaselineErrors]:
+    """Errors of predictors on the fitted and the test recordings, or the reason if one cannot predict."""
+    errors = {}
+    for name, (title, description, predict) in predictors.items():
+        figures: list[ErrorFigures | None] = []
+        reason = ""
+        for recordings in (fit, test):
+            try:
+                figures.append(score({t.name: predict(t) for t in recordings}, measured_paths(recordings)))
+            except InputError as error:
+                figures.append(None)
+                reason = str(error)
+        errors[name] = BaselineErrors(name, title, description, figures[0], figures[1], reason)
+    return errors
+
+
+def fit_fir(fit: Sequence[Trajectory], groups: Sequence[Sequence[int]], *, degree: int) -> FirRegression:
+    """Train on recordings; the span of the history and the penalty are chosen by cross-validation.
+
+    One group of repeats is left out at a time, or one of `BLOCKS` stretches of time if all recordings share their
+    commands.
+
+    Args:
+        fit: recordings.
+        groups: indices of recordings with identical commands.
+        degree: highest power of a command, 1 for a linear regression.
+    """
+    rows = [len(t.time) for t in fit]
+    if len(groups) > 1:
+        group_of = {index: number for number, group in enumerate(groups) for index in group}
+        fold = np.concatenate([np.full(n, group_of[i]) for i, n in enumerate(rows)])
+    else:
+        fold = np.concatenate([np.arange(n) * BLOCKS // n for n in rows])
+    step = sample_time(*(t.time for t in fit))
+    trained = [_train(fit, fold, _lags(span, step), degree) for span in _distinct_spans(step)]
+    return min(trained, key=lambda regression: regression.error)
+
+
+def _distinct_spans(step: float) -> list[float]:
+    """Spans that are the same at this sample time count once."""
+    return list({tuple(np.round(_lags(span, step) / step)): span for span in reversed(SPANS)}.values())
+
+
+def _lags(span: float, step: float) -> Float[np.ndarray, " lag"]:
+    return np.unique(np.round(np.linspace(0.0, span, LAGS) / step)) * step
+
+
+def _features(recording: Trajectory, lags: Float[np.ndarray, " lag"], degree: int) -> Float[np.ndarray, "time feature"]:
+    time = recording.time
+    history = recording.command_at((time[:, None] - lags[None]).reshape(-1)).reshape(len(time), -1)
+    return np.concatenate([history**power for power in range(1, degree + 1)], axis=1)
+
+
+def _train(
+    fit: Sequence[Trajectory], fold: Int[np.ndarray, " row"], lags: Float[np.ndarray, " lag"], degree: int
+) -> FirRegression:
+    features = np.concatenate([_features(t, lags, degree) for t in fit])
+    centre, deviation = features.mean(axis=0), features.std(axis=0)
+    scale = np.where(
+        deviation > 1e-12 * np.maximum(np.abs(centre), 1e-12), deviation, np.inf
+    )  # constants weigh nothing
+    standard = (features - centre) / scale
+    position = np.concatenate([t.position for t in fit])
+    mask = np.concatenate([t.position_mask for t in fit])
+    alike = [(usable, np.flatnonzero((mask == usable[:, None]).all(axis=0))) for usable in np.unique(mask, axis=1).T]
+    squares, total = np.zeros(len(PENALTIES)), 0
+    for usable, markers in alike:  # one factorisation serves all markers that are usable in the same rows
+        for number in np.unique(fold):
+            tested, used = usable & (fold == number), usable & (fold != number)
+            if tested.any() and used.any():
+                offset, weights = _ridge(standard[used], position[used][:, markers], PENALTIES)
+                predicted = offset[:, None] + (standard[tested] @ weights.reshape(*weights.shape[:2], -1)).reshape(
+                    len(PENALTIES), -1, len(markers), 3
+                )
+                residual = position[tested][:, markers] - predicted
+                squares += (residual**2).sum(axis=(1, 2, 3))
+                total += int(tested.sum()) * len(markers)
+    best = int(np.argmin(squares))
+    offset, weights = np.zeros(position.shape[1:]), np.zeros((position.shape[1], standard.shape[1], 3))
+    for usable, markers in alike:
+        if usable.any():
+            pose, slope = _ridge(standard[usable], position[usable][:, markers], PENALTIES[best : best + 1])
+            offset[markers], weights[markers] = pose[0], np.moveaxis(slope[0], 0, 1)
+    return FirRegression(
+        lags,
+        degree,
+        features.min(axis=0),
+        features.max(axis=0),
+        centre,
+        scale,
+        offset,
+        weights,
+        float(PENALTIES[best]),
+        float(np.sqrt(squares[best] / total)) if total else np.inf,
+    )
+
+
+def _ridge(
+    features: Float[np.ndarray, "row feature"],
+    position: Float[np.ndarray, "row marker 3"],
+    penalties: Float[np.ndarray, " penalty"],
+) -> tuple[Float[np.ndarray, "penalty marker 3"], Float[np.ndarray, "penalty feature marker 3"]]:
+    """Offset and weights for every penalty, from one eigendecomposition of the normal equations.
+
+    The offset takes up the mean of the features over these rows, and is not penalised.
+    """
+    rows, shape = len(features), position.shape[1:]
+    shift, mean = features.mean(axis=0), position.mean(axis=0)
+    centred, target = features - shift, (position - mean).reshape(rows, -1)
+    values, vectors = np.linalg.eigh(centred.T @ centred / rows)
+    projected = vectors.T @ (centred.T @ target) / rows
+    shrunk = projected / (np.maximum(values, 0.0)[:, None] + penalties[:, None, None])
+    weights = (vectors @ shrunk).reshape(len(penalties), features.shape[1], *shape)
+    return mean - np.tensordot(weights, shift, axes=(1, 0)), weights

@@ -11,8 +11,8 @@ from typing import Any
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.report.baselines import BaselineErrors
-from rfdropo_bayes.report.object_scores import ObjectScore
 from rfdropo_bayes.report.residuals import ResidualCheck
+from rfdropo_bayes.report.scores import ObjectScore
 
 PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
 LEARNING = ("torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime")  # packages that policies are made with

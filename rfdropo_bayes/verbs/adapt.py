@@ -50,10 +50,10 @@ from rfdropo_bayes.prediction.predictive import (
 from rfdropo_bayes.prediction.session_error import SESSION_ERROR, SessionError, reach_of, recorded_session_error
 from rfdropo_bayes.prediction.session_fit import SessionFit, fit_session
 from rfdropo_bayes.report import BaselineErrors, build_summary
+from rfdropo_bayes.report.baselines import session_baselines
 from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
 from rfdropo_bayes.report.scores import MeasuredPath
-from rfdropo_bayes.report.session_baselines import session_baselines
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_fit

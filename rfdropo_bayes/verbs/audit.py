@@ -52,8 +52,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.report import software_versions
-from rfdropo_bayes.report.audit_page import render_audit, shown
-from rfdropo_bayes.report.residual_file import residual_dataset
+from rfdropo_bayes.report.audit_page import render_audit, residual_dataset, shown
 from rfdropo_bayes.report.run_files import SUMMARY
 from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit
@@ -63,9 +62,9 @@ from rfdropo_bayes.signatures import as_options, stated
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.commands import Commands, stack_commands
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, BodyMechanism, Mechanism, obstacle
-from rfdropo_bayes.simulators.parameters import ParameterSpec, nearest
+from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.trunk import TrunkSimulator
-from rfdropo_bayes.tables import changed, parse_table
+from rfdropo_bayes.tables import changed, nearest, parse_table
 from rfdropo_bayes.verbs.arguments import given_model
 from rfdropo_bayes.verbs.between import Between, confine_laws, extend_groups, find_groups, groups_at_hand
 from rfdropo_bayes.verbs.motion_direction import Paths

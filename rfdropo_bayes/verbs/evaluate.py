@@ -30,7 +30,7 @@ from rfdropo_bayes.policies.evaluation import (
     success,
 )
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
-from rfdropo_bayes.policies.policy_figures import save_animation, success_figure
+from rfdropo_bayes.policies.policy_page import save_animation, success_figure
 from rfdropo_bayes.policies.randomisation import Randomisation
 from rfdropo_bayes.policies.rendering import frames_of
 from rfdropo_bayes.policies.tasks import Task, observed_of
@@ -163,8 +163,8 @@ def _episodes_for(
 
 
 def _otherwise_trained(policies: Mapping[str, ExportedPolicy], integrator: str) -> list[str]:
-    """Sentences on policies that were trained with another integrator; the default is Euler's."""
-    trained = {name: policy.facts.get(INTEGRATOR, "euler") for name, policy in policies.items()}
+    """Sentences on policies that were trained with another integrator."""
+    trained = {name: policy.facts.get(INTEGRATOR, integrator) for name, policy in policies.items()}
     return [
         f"{name} was trained with integrator {given!r}, and is evaluated with {integrator!r}."
         for name, given in trained.items()

@@ -15,8 +15,7 @@ from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.data import Trajectory, group_repeats
-from rfdropo_bayes.report.baselines import mean_pose
-from rfdropo_bayes.report.fir import fit_fir
+from rfdropo_bayes.report.baselines import fit_fir, mean_pose
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, rows_of, spread_rows
 
 FITTED, SHOWN = 60, 240  # rows that are fitted, and rows whose residuals are shown

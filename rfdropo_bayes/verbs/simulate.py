@@ -23,9 +23,8 @@ from rfdropo_bayes.model.experiment import CommandsTable, NoiseTable
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import run_folder
 from rfdropo_bayes.simulators.commands import Commands
-from rfdropo_bayes.simulators.parameters import nearest
 from rfdropo_bayes.simulators.protocol import Result
-from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.tables import nearest, parse_table
 from rfdropo_bayes.verbs.arguments import given_model
 
 # Number that the first marker's column carries in each source.

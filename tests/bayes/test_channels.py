@@ -17,7 +17,6 @@ from rfdropo_bayes.bayes.channels.tension import TENSION_NOISE
 from rfdropo_bayes.bayes.noise import Autoregression, noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.repeat_noise import deviations, group_recordings, with_noise_of_repeats
-from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
@@ -26,6 +25,7 @@ from rfdropo_bayes.inference import methods
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
+from studies.replicas import simulated_data
 
 STEP, ROWS = 0.1, 12
 SIZES = {"observation_noise": 2e-3, "tension_noise": 0.05, "motor_angle_noise": 0.01}

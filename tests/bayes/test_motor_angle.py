@@ -17,7 +17,6 @@ from rfdropo_bayes.bayes.channels import Markers, MotorAngle
 from rfdropo_bayes.bayes.channels.motor_angle import MOTOR_ANGLE_NOISE
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import CsvColumns, Measured, Origin, SentCommands, Trajectory
@@ -35,6 +34,7 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism, inside_drive
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
+from studies.replicas import simulated_data, with_measured
 
 STEP = 0.02  # [s], of the simulation and of the recording
 LAG = REGISTRY["actuator_lag"]()
@@ -128,7 +128,7 @@ def test_the_density_of_the_angles_is_that_of_normals_at_new_readings_only():
     assert float(joint) == pytest.approx(with_angles.sum() + prior, rel=1e-9)
     # A prefix holds the rows of the whole, and data put in the model's place count as its own do.
     np.testing.assert_allclose(chosen.row_log_likelihood(values, 20)[0][0], with_angles[:20])
-    shifted = chosen.with_measured({**chosen.measured, "motor_angle": chosen.measured["motor_angle"] + 1.0})
+    shifted = with_measured(chosen, {**chosen.measured, "motor_angle": chosen.measured["motor_angle"] + 1.0})
     assert shifted.row_log_likelihood(values, 60)[0][0].sum() < with_angles.sum() - 1000.0
     assert len({chosen.fingerprint, plain.fingerprint, shifted.fingerprint}) == 3
 

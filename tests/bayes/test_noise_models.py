@@ -24,6 +24,7 @@ from rfdropo_bayes.report.residuals import check_residuals, residual_cautions
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
+from studies.replicas import with_measured
 
 STEP, ROWS, SIGMA = 0.05, 150, 2e-3
 LAG = REGISTRY["actuator_lag"]()
@@ -84,7 +85,7 @@ def with_error(noise: str, error: np.ndarray) -> CalibrationProblem:
     values = {spec.name: np.array([spec.nominal]) for spec in noise_specs(noise)}
     clean = np.asarray(chosen.observe(values | {n: np.array([v]) for n, v in PHYSICAL.items()}).position)[0]
     measured = np.where(chosen.model.recordings.line.valid[..., None], clean + error, 0.0)
-    return chosen.with_measured({"markers": measured})
+    return with_measured(chosen, {"markers": measured})
 
 
 def autoregressive(rng: np.random.Generator, phi: float) -> np.ndarray:

@@ -15,7 +15,6 @@ from rfdropo_bayes.bayes.channels import Markers, ObjectPose
 from rfdropo_bayes.bayes.channels.object_pose import LEVER, draw_object_error
 from rfdropo_bayes.bayes.noise import noise_specs
 from rfdropo_bayes.bayes.recordings import gather_recordings
-from rfdropo_bayes.bayes.replicas import simulated_data
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory
@@ -24,6 +23,7 @@ from rfdropo_bayes.model.assembly import SWITCHED
 from rfdropo_bayes.simulators.commands import commands_on_grid, sample
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 from rfdropo_bayes.simulators.protocol import Observation
+from studies.replicas import noisy_rollouts, simulated_data, with_measured
 
 STEP = 0.1  # [s]
 START = np.array([0.02, 0.0, 0.1])
@@ -155,7 +155,7 @@ def test_the_density_of_the_poses_is_that_of_an_ornstein_uhlenbeck_process_about
     squares = [float(jnp.sum(chosen.residuals(v, 30) ** 2)) for v in (single, further)]
     there = chosen.row_log_likelihood({**values, "slip": jnp.array([0.5])}, 30)[0][0]
     assert there.sum() - rows.sum() == pytest.approx(0.5 * (squares[0] - squares[1]), rel=1e-9)
-    moved = chosen.with_measured({**chosen.measured, "object_pose": chosen.measured["object_pose"] + 0.1})
+    moved = with_measured(chosen, {**chosen.measured, "object_pose": chosen.measured["object_pose"] + 0.1})
     assert moved.row_log_likelihood(values, 30)[0][0].sum() < rows.sum() - 100.0
     assert len({chosen.fingerprint, plain.fingerprint, moved.fingerprint}) == 3
 
@@ -180,7 +180,7 @@ def test_poses_tell_what_the_tip_does_not():
     step = 1e-3
     batch = {name: np.full(3, value) for name, value in TRUTH.items()}
     batch["slip"] = TRUTH["slip"] + np.array([0.0, -step, step])
-    left, below, above = chosen.with_measured(made).residual_batch(batch, 30)
+    left, below, above = with_measured(chosen, made).residual_batch(batch, 30)
     slope = (above - below) / (2.0 * step)
     deviation = 1.0 / np.linalg.norm(slope)
     # A share of 75 mm, seen to 2 mm, and a turn of 0.37 rad, seen to 0.05 rad: five correlation times are a few looks.
@@ -212,7 +212,7 @@ def test_methods_that_compare_rollouts_see_the_way_and_the_turn_of_the_body():
     np.testing.assert_allclose(chosen.observed[:, 3:], clean[0, :, 3:], atol=1e-9)  # the body was read without noise
     assert not chosen.observed_mask[7, 3:].any()
     assert chosen.observed_mask[8].all()
-    noise = chosen.noisy_rollouts(jax.random.key(0), values)[0] - clean
+    noise = noisy_rollouts(chosen, jax.random.key(0), values)[0] - clean
     assert not noise[:, 0, 3:].any()
     # 4000 draws know a deviation to 1.1 %: 5 times that.
     decayed = np.sqrt(1.0 - np.exp(-2.0 * 2.9 / 0.5))

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.channels import Orientation, Seen
-from rfdropo_bayes.bayes.channels.quaternions import of_rotation_vector, product
+from rfdropo_bayes.bayes.channels.object_pose import of_rotation_vector, product
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import orientations
+from studies.replicas import drawn
 
 TURNS = Rotation.random(6, random_state=np.random.default_rng(0))
 
@@ -62,8 +63,8 @@ def test_a_turn_of_the_frame_takes_a_constant_turn_out():
 def test_draws_have_the_size_of_the_noise():
     many = np.tile(TURNS.as_quat()[0], (4000, 1))
     one = channel(many)
-    drawn = one.draw(jax.random.key(0), seen(many))
-    assert np.std(one.deviation(drawn, many[None])) == pytest.approx(0.01, rel=0.03)
+    errors = drawn(one, jax.random.key(0), seen(many))
+    assert np.std(one.deviation(errors, many[None])) == pytest.approx(0.01, rel=0.03)
 
 
 def test_columns_may_hold_quaternions_or_rotation_vectors():

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes import fem  # noqa: F401  (double precision)
-from rfdropo_bayes.fem.chain import Chain, ascend, descend, eliminate
-from rfdropo_bayes.fem.lanes import laned
 from rfdropo_bayes.fem.rod_elements import Stiffness
+from rfdropo_bayes.fem.stage_solve import Chain, ascend, descend, eliminate, laned
 
 STATIONS, ROWS = 4, 2
 

@@ -43,7 +43,7 @@ def alone(problem, *further):
         ),
         (
             alone(Spring(), "fingerprint", "prior_ends", "status_names", "rollouts", "physical_names", "observed"),
-            r"Bare has 'rollouts' but lacks actions, noise_deviation, noisy_rollouts, observed_mask; .*RolloutProblem",
+            r"Bare has 'rollouts' but lacks noise_deviation, observed_mask; .*RolloutProblem",
         ),
     ],
 )
@@ -75,11 +75,3 @@ def test_derivatives_of_the_prior_are_those_of_its_density():
     gradient, hessian = ProblemDefaults.prior_derivatives.func(problem)
     np.testing.assert_allclose(gradient(u), (problem.mean - u) / problem.sd**2, rtol=1e-5)
     np.testing.assert_allclose(hessian(u), -np.diag(problem.sd**-2.0), rtol=1e-5, atol=1e-12)
-
-
-def test_rollouts_without_noise_are_their_own_noisy_ones():
-    problem = Spring()
-    values = problem.sample_prior(KEY, 3)
-    np.testing.assert_array_equal(problem.noisy_rollouts(KEY, values)[0], problem.rollouts(values, problem.n_rows)[0])
-    np.testing.assert_array_equal(problem.noise_deviation({}), [0.0, 0.0])
-    assert problem.actions.shape == (problem.n_rows, 0)

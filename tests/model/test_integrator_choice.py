@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
-from rfdropo_bayes.errors import InputError, Interrupted
+from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_robot_simulator, integrator_of
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.experiment_file import describe, read_tables
@@ -70,39 +70,15 @@ def test_a_run_states_its_integrator(tmp_path):
     assert rb.Model("smooth_arm").tables()["simulator"] == {"integrator": "sdirk2"}
 
 
-@pytest.mark.parametrize("name", ["config.toml", "extended.toml"])
-@pytest.mark.parametrize("result", ["run.json", "summary.json", "audit.json"])
-def test_runs_of_versions_that_had_euler_alone_are_read_with_it(tmp_path, name, result):
-    path = written(tmp_path / name)
-    assert integrator_of(rb.Model.read(path).spec) == "sdirk2"  # a user's file that no run wrote
-    (tmp_path / result).write_text("{}")
-    assert integrator_of(rb.Model.read(path).spec) == "euler"
-    assert integrator_of(rb.Model.read(path, ["simulator.integrator=sdirk2"]).spec) == "sdirk2"
-    written(path, EXPERIMENT + 'integrator = "sdirk2"\n')
-    assert integrator_of(rb.Model.read(path).spec) == "sdirk2"
-
-
-def test_a_run_that_euler_began_goes_on_with_it(tmp_path):
-    def begin(tables: dict, resume: bool = False) -> None:
-        with run_folder(tmp_path / "run", "calibrate", tables=tables, resume=resume):
-            raise KeyboardInterrupt
-
-    tables = {"robot": "smooth_arm", "simulator": {"refine": 1}}
-    with pytest.raises(Interrupted):
-        begin(tables)
-    now = {**tables, "simulator": {"refine": 1, "integrator": "sdirk2"}}
-    with pytest.raises(InputError, match=r"simulator\.integrator was euler and is now sdirk2"):
-        begin(now, resume=True)
-
-
 def test_an_answer_is_used_with_the_integrator_of_its_fit(tmp_path):
     assert fitted_integrator({INTEGRATOR: "sdirk2"}) == "sdirk2"
-    assert fitted_integrator({}) == "euler"
+    assert fitted_integrator({}) is None
     written(tmp_path / CONFIG, EXPERIMENT + 'integrator = "sdirk2"\n')
     assert fitted_integrator({}, tmp_path) == "sdirk2"
     check_fitted_integrator("euler", None, where="a black box")
     early, late = (
-        Calibration(posterior(**given), {}, "", rb.Model("smooth_arm")) for given in ({}, {INTEGRATOR: "sdirk2"})
+        Calibration(posterior(**given), {}, "", rb.Model("smooth_arm"))
+        for given in ({INTEGRATOR: "euler"}, {INTEGRATOR: "sdirk2"})
     )
     assert model_of(late) is late.model
     with pytest.raises(InputError, match=r"fitted with integrator 'euler', .*'sdirk2'.*simulator.integrator=euler"):
@@ -110,7 +86,7 @@ def test_an_answer_is_used_with_the_integrator_of_its_fit(tmp_path):
 
 
 def test_training_over_a_posterior_takes_its_integrator(tmp_path):
-    posterior().save(tmp_path / POSTERIOR)
+    posterior(**{INTEGRATOR: "euler"}).save(tmp_path / POSTERIOR)
     training = {"task": "TrunkReach-v0", "randomisation": "posterior", "source": str(tmp_path)}
     for integrator, fits in (("euler", True), ("sdirk2", False)):
         tables = {"robot": "trunk_sofa", "simulator": {"integrator": integrator}, "training": training}
@@ -119,13 +95,16 @@ def test_training_over_a_posterior_takes_its_integrator(tmp_path):
         if fits:
             assert "young_modulus" in randomisation_of(table, model.spec, simulator).names
             continue
-        for given in (None, tmp_path, Calibration(posterior(), {}, "")):
+        for given in (None, tmp_path, Calibration(posterior(**{INTEGRATOR: "euler"}), {}, "")):
             with pytest.raises(InputError, match="fitted with integrator 'euler'"):
                 randomisation_of(table, model.spec, simulator, given)
 
 
 def test_an_evaluation_says_which_policies_were_trained_otherwise():
-    policies = {"old": SimpleNamespace(facts={}), "new": SimpleNamespace(facts={INTEGRATOR: "sdirk2"})}
+    policies = {
+        "old": SimpleNamespace(facts={INTEGRATOR: "euler"}),
+        "new": SimpleNamespace(facts={INTEGRATOR: "sdirk2"}),
+    }
     said = _otherwise_trained(policies, "sdirk2")
     assert said == ["old was trained with integrator 'euler', and is evaluated with 'sdirk2'."]
     assert _otherwise_trained({"old": policies["old"]}, "euler") == []

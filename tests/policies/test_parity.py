@@ -12,12 +12,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.policies import parity
+from rfdropo_bayes.policies import onnx_export
 from rfdropo_bayes.policies import training as run
-from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy
-from rfdropo_bayes.policies.parity import check_exportable, difference, observations
-from rfdropo_bayes.policies.ppo import ppo_options
-from rfdropo_bayes.policies.training import Trained, train
+from rfdropo_bayes.policies.onnx_export import ExportedPolicy, check_exportable, difference, export_policy, observations
+from rfdropo_bayes.policies.training import Trained, ppo_options, train
 from rfdropo_bayes.policies.training_config import TrainingTable
 from tests.policies.toys import Points, layout
 
@@ -95,7 +93,7 @@ def test_what_cannot_be_exported_is_refused(kind, kwargs, words) -> None:
 
 def test_an_export_that_leaves_out_a_tanh_is_refused(monkeypatch) -> None:
     """The actions of an untrained policy are near zero, where a tanh does nothing."""
-    real = parity.policy_layers
+    real = onnx_export.policy_layers
     policy = untrained(SQUASHED)
     check(policy)
     monkeypatch.setattr("rfdropo_bayes.policies.onnx_export.policy_layers", lambda model: (real(model)[0], False))
@@ -106,7 +104,7 @@ def test_an_export_that_leaves_out_a_tanh_is_refused(monkeypatch) -> None:
 def test_an_export_without_the_limits_of_the_normalisation_is_refused(monkeypatch) -> None:
     policy = untrained({})
     unlimited = VecNormalize(Points(4), epsilon=1e-4, clip_obs=1e9)
-    monkeypatch.setattr(parity, "export_policy", lambda model, _, *rest: export_policy(model, unlimited, *rest))
+    monkeypatch.setattr(onnx_export, "export_policy", lambda model, _, *rest: export_policy(model, unlimited, *rest))
     with pytest.raises(InputError, match="would act otherwise"):
         check(policy)
 

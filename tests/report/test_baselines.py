@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,33 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rfdropo_bayes.data import DataSpec, Measured, Origin, SentCommands, Trajectory, load_recordings
+from rfdropo_bayes.data import DataSpec, Measured, Origin, SentCommands, Trajectory, command_openings, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report import BaselineErrors, baseline_errors
-from rfdropo_bayes.report.baselines import (
-    copied_mean,
-    held_initial_pose,
-    mean_pose,
-    repeated_mean,
-    with_fitted_commands,
-)
-from rfdropo_bayes.report.fir import fit_fir
+from rfdropo_bayes.report.baselines import Predictor, fit_fir, held_pose, mean_pose, repeated_mean, with_fitted_commands
+from rfdropo_bayes.report.scores import measured_paths
 
 
 def test_held_poses(run: Any) -> None:
     first = run.fit[1]
-    np.testing.assert_array_equal(held_initial_pose(first)[37], first.position[0])
+    np.testing.assert_array_equal(held_pose(first)(first)[37], first.position[0])
     pose = mean_pose([first])(run.test[0])
     usable = first.position_mask[:, 1]
     np.testing.assert_allclose(pose[5, 1], first.position[usable, 1].mean(axis=0))
-
-
-def test_the_copied_mean_leaves_the_recording_itself_out(run: Any) -> None:
-    a, b, c = run.fit
-    np.testing.assert_allclose(copied_mean([a, c])(b), 0.5 * (a.position + c.position), atol=1e-12)
-    np.testing.assert_allclose(copied_mean([a, c])(a), c.position, atol=1e-12)
-    with pytest.raises(InputError, match="as this recording does"):
-        copied_mean([a])(a)
 
 
 def linear(toy: SimpleNamespace, name: str, rows: int, rng: np.random.Generator) -> Trajectory:
@@ -81,23 +68,27 @@ def test_a_masked_row_teaches_nothing(run: Any) -> None:
     np.testing.assert_allclose(one.predict(run.test[0]), other.predict(run.test[0]), rtol=1e-9)
 
 
+def repeated(fit: Sequence[Trajectory]) -> Predictor:
+    return repeated_mean(measured_paths(fit), {t.name: command_openings(t) for t in fit})
+
+
 def test_the_mean_of_repeats_is_that_of_the_same_commands_alone(run: Any) -> None:
     """Its last pose is held where the repeats end; a recording of other commands has none."""
     a, c = run.fit[0], run.fit[2]
     b = a.with_attributes(name="again")
     short = a.slice_rows(0, 20)
     other = Trajectory(c.dataset.assign(command=c.dataset["command"] + 0.01)).with_attributes(name="other")
-    predicted = repeated_mean([short, other])(b)
+    predicted = repeated([short, other])(b)
     usable = short.position_mask[:, 1]
     np.testing.assert_allclose(predicted[:21][usable, 1], a.position[:21][usable, 1], atol=1e-12)
     last = short.position[usable, 1][-1]
     np.testing.assert_allclose(predicted[21:, 1], np.broadcast_to(last, b.position[21:, 1].shape), atol=1e-12)
     with pytest.raises(InputError, match="no other fitted recording has the same commands"):
-        repeated_mean([a, b])(other)
+        repeated([a, b])(other)
     slow = Trajectory(a.dataset.assign_coords(command_time=2.0 * a.dataset["command_time"]))
     slow = slow.with_attributes(name="slow")
     with pytest.raises(InputError, match="no other fitted recording has the same commands"):  # at the same speed
-        repeated_mean([a, b])(slow)
+        repeated([a, b])(slow)
     assert with_fitted_commands([short], [b, other, slow]) == [b.name]
 
 
@@ -119,11 +110,10 @@ def headline(errors: BaselineErrors) -> float:
 
 
 def test_known_figures_of_the_trunk_that_pushes_a_cube(datasets: Path) -> None:
-    """January copied to April: 103 mm; April's own initial pose held: 78 mm over time."""
+    """The initial pose held: 78 mm over time."""
     spec = DataSpec(format="optitrack-csv", fit=["sim2real_trunk/AKLWI_*.csv"], test=["sim2real_trunk/AKLWI2_*.csv"])
     fit, test = load_recordings(spec, datasets), load_recordings(spec, datasets, "test")
     errors = baseline_errors(fit, test)
-    assert headline(errors["copied_mean"]) == pytest.approx(103.0, rel=0.015)
     assert headline(errors["initial_pose"]) == pytest.approx(77.8, rel=0.02)
     held = errors["initial_pose"].test
     assert held is not None
@@ -144,7 +134,6 @@ def test_known_figures_of_the_hanging_trunk(datasets: Path) -> None:
     short = baseline_errors([whole.slice_rows(0, 2000).resample(0.05)], test)
     assert headline(short["mean_pose"]) == pytest.approx(65.4, abs=0.3)
     assert headline(short["fir_linear"]) < 24.0
-    assert "as this recording does" in short["copied_mean"].reason
     long = baseline_errors([whole.slice_rows(0, 9999).resample(0.05)], test)
     assert headline(long["fir_cubic"]) < 18.8
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, command_openings
+from rfdropo_bayes.report.baselines import session_baselines
 from rfdropo_bayes.report.scores import MeasuredPath, measured_paths
-from rfdropo_bayes.report.session_baselines import session_baselines
 
 ROWS, SHOWN, STEP = 40, 10, 0.25
 RNG = np.random.default_rng(0)
@@ -47,7 +47,7 @@ def test_recordings_of_other_commands_are_not_copied():
     *_, found = of_a_day(COMMAND[::-1])
     assert found["first_row"].test is not None
     assert found["copied"].test is None
-    assert "no fitted recording has the same commands" in found["scaled_copy"].reason
+    assert "no other fitted recording has the same commands" in found["scaled_copy"].reason
 
 
 def test_a_marker_that_was_lost_in_an_earlier_day_is_not_copied():

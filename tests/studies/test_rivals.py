@@ -14,6 +14,7 @@ import pytest
 from rfdropo_bayes.bayes.problem import RolloutDefaults
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
+from studies.replicas import noisy_rollouts
 from studies.rivals import StandardPrior, cross_correlation_summary, informative, thinned_summary
 from tests.inference.toys import LinearGaussian, Spring
 
@@ -38,9 +39,11 @@ class LinearRollouts(RolloutDefaults, LinearGaussian):
         u = np.stack([np.asarray(values[name]) for name in self.names], axis=1)
         return (u @ self.design.T)[:, :horizon, None], np.zeros(len(u), dtype=int)
 
-    def noisy_rollouts(self, key, values):
-        clean, status = self.rollouts(values, self.n_rows)
-        return clean + self.noise[:, None] * np.asarray(jax.random.normal(key, clean.shape)), status
+
+@noisy_rollouts.register
+def _(problem: LinearRollouts, key, values):
+    clean, status = problem.rollouts(values, problem.n_rows)
+    return clean + problem.noise[:, None] * np.asarray(jax.random.normal(key, clean.shape)), status
 
 
 def test_the_cross_correlation_summary_by_hand():

@@ -25,6 +25,7 @@ from rfdropo_bayes.prediction.predictive import FITTED, NOISE
 from rfdropo_bayes.report import page
 from rfdropo_bayes.verbs import adapt as adaptation
 from rfdropo_bayes.verbs.left_out_sessions import of_unseen_sessions, openings_of
+from studies.replicas import with_measured
 from tests.undrawn import without_panels
 from tests.verbs.toys import BOX, PRIORS, SIGMA, STEP
 
@@ -65,7 +66,7 @@ def test_a_model_of_days_whose_spread_is_held_keeps_start_data_and_listeners():
     earlier = {"gain": {"": np.full(2, 1.1 * GAIN)}, "zero_deviation": {"day_1": np.full(2, 0.004)}}
     whole = model.problem(recorded(["day_0_a", "day_1_a"], [0.0, 0.01], 0), earlier)
     other = {name: 2.0 * measured for name, measured in whole.measured.items()}
-    whole = whole.with_measured(other).counting({"markers": 0.5})
+    whole = with_measured(whole, other).counting({"markers": 0.5})
     told: list[float] = []
     held = whole.telling(told.append).holding(whole.typical_scales)
     assert set(whole.names) - set(held.names) == {"zero_spread"}

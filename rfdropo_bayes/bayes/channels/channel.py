@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float
 
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.data import Trajectory
@@ -51,10 +50,6 @@ class Channel(ABC):
         """Log density of each row given the earlier rows, summed over recordings. Data without a time axis count in the
         first row.
         """
-
-    @abstractmethod
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Array, "..."]:
-        """A simulated measurement: the model's observation with a draw of the noise."""
 
 
 @dataclass(frozen=True)
@@ -188,12 +183,6 @@ class WhiteSeries(Series):
     def stated(self, values: Mapping[str, float], step: float) -> Autoregression:
         return Autoregression(np.full(self.valid.shape[-1], values[self.size.name]), np.ones(1), STATED, np.inf)
 
-    def draw_errors(self, key: PRNGKeyArray, values: Mapping[str, Any]) -> Float[Any, "recording time column"]:
-        """Errors of a replica, in the unit of the noise."""
-        if self.known is not None:
-            return self.known.draw_recordings(key, *self.readings.shape[:2])
-        return values[self.size.name] * jax.random.normal(key, self.readings.shape)
-
 
 def padded_readings(
     trajectories: Sequence[Trajectory],
@@ -260,11 +249,6 @@ class FeatureChannel(Protocol):
 
     def features(self, readings: Float[Any, "recording time *reading"]) -> Float[Any, "recording time feature"]:
         """Features of readings [m]."""
-
-    def draw_features(
-        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
-    ) -> Float[Array, "time feature"]:
-        """A realisation of the features' noise [m] in one recording."""
 
     def feature_deviation(self, values: Mapping[str, Any]) -> Float[np.ndarray, " feature"]:
         """Standard deviation of the features' noise [m]."""

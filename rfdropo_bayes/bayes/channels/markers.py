@@ -104,11 +104,6 @@ class Markers(Series):
             return self.known.draw_rows(key, len(time), time).reshape(len(time), markers, 3)
         return draw_noise(key, time, markers, noise_values(self.model, values))
 
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time marker 3"]:
-        keys = jax.random.split(key, len(self.readings))
-        noise = jax.vmap(lambda k, t: self.draw_noise(k, t, seen.values))(keys, jnp.asarray(self.recordings.time))
-        return jnp.where(self.recordings.line.valid[..., None], self.expected(seen) + noise, 0.0)
-
     def distribution(self, seen: Seen, index: int) -> dist.Distribution:
         """Numpyro distribution of the positions in one recording."""
         rows = int(self.recordings.rows[index])
@@ -125,11 +120,6 @@ class Markers(Series):
     def features(self, readings: Float[Any, "recording time marker 3"]) -> Float[Any, "recording time feature"]:
         """See `FeatureChannel`: coordinates of the markers."""
         return _flat(readings)
-
-    def draw_features(
-        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
-    ) -> Float[Array, "time feature"]:
-        return self.draw_noise(key, time, values).reshape(len(time), -1)
 
     def feature_deviation(self, values: Mapping[str, Any]) -> Float[np.ndarray, " feature"]:
         if self.known is not None:

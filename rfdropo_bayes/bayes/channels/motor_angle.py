@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries, padded_readings
 from rfdropo_bayes.data import Trajectory
@@ -88,6 +87,3 @@ class MotorAngle(WhiteSeries):
     ) -> Float[Any, "recording time channel"]:
         """Difference of measured and simulated angles [rad]; see `Series.deviation`."""
         return measured - about
-
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time channel"]:
-        return jnp.where(self.valid, self.expected(seen) + self.draw_errors(key, seen.values), 0.0)

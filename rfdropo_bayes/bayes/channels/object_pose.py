@@ -20,7 +20,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Seen, Series
-from rfdropo_bayes.bayes.channels.quaternions import inverse, product, turn_between
 from rfdropo_bayes.bayes.noise import Autoregression, Noise, Timeline, draw_noise, timeline, whiten
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.data import Trajectory
@@ -195,11 +194,6 @@ class ObjectPose(Series):
         memory = [] if tau is None else [float(np.exp(-step / tau))]
         return Autoregression(sizes, np.array([1.0, *memory]), STATED, np.inf, step=step)
 
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time 7"]:
-        clean, keys = self.expected(seen), jax.random.split(key, len(self.readings))
-        drawn = jax.vmap(lambda k, p, t: draw_object_error(k, p, t, seen.values, self.known))
-        return jnp.where(self.line.valid, drawn(keys, clean, jnp.asarray(self.time)), 0.0)
-
     @property
     def feature_valid(self) -> Bool[np.ndarray, "recording time feature"]:
         return np.repeat(self.line.valid, 6, axis=-1)
@@ -210,13 +204,6 @@ class ObjectPose(Series):
         turn = _turn_since_start(readings[..., 3:])
         none = jnp.broadcast_to(jnp.array([0.0, 0.0, 0.0, 1.0]), turn.shape)
         return jnp.concatenate([readings[..., :3], LEVER * turn_between(none, turn)], axis=-1)
-
-    def draw_features(
-        self, key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any]
-    ) -> Float[Array, "time feature"]:
-        """See `FeatureChannel`; for turns much smaller than one."""
-        error = _error(key, time, values, self.known)
-        return jnp.concatenate([error[:, 0], LEVER * error[:, 1]], axis=1)
 
     def feature_deviation(self, values: Mapping[str, Any]) -> Float[np.ndarray, " feature"]:
         """See `FeatureChannel`: long after the start."""
@@ -238,13 +225,13 @@ def draw_object_error(
     known: Autoregression | None = None,
 ) -> Float[Array, "time 7"]:
     """A body's poses with a realisation of the noise of centre and turn; the first row has no noise."""
-    error = _error(key, time, values, known)
+    error = object_error(key, time, values, known)
     half = 0.5 * jnp.linalg.norm(error[:, 1], axis=1, keepdims=True)
     turn = jnp.concatenate([0.5 * jnp.sinc(half / jnp.pi) * error[:, 1], jnp.cos(half)], axis=1)
     return jnp.concatenate([pose[:, :3] + error[:, 0], product(turn, pose[:, 3:])], axis=1)
 
 
-def _error(
+def object_error(
     key: PRNGKeyArray, time: Float[Array, " time"], values: Mapping[str, Any], known: Autoregression | None
 ) -> Float[Array, "time 2 3"]:
     """Noise of centre [m] and turn [rad].
@@ -263,3 +250,33 @@ def _error(
 
 def _turn_since_start(q: Float[Any, "recording time 4"]) -> Float[Any, "recording time 4"]:
     return product(q, inverse(q[:, :1]))
+
+
+def inverse(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+    """The rotation back."""
+    return q * jnp.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def product(a: Float[Array, "... 4"], b: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
+    """First b, then a."""
+    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + jnp.cross(a[..., :3], b[..., :3])
+    scalar = a[..., 3] * b[..., 3] - jnp.sum(a[..., :3] * b[..., :3], axis=-1)
+    return jnp.concatenate([vector, scalar[..., None]], axis=-1)
+
+
+def turn_between(first: Float[Any, "... 4"], second: Float[Any, "... 4"]) -> Float[Any, "... 3"]:
+    """Twice the vector of the quaternion from one turn to another: the rotation vector [rad] for small turns, without a
+    singularity for large turns.
+    """
+    between = product(second, inverse(first))
+    return 2.0 * jnp.where(between[..., 3:] < 0.0, -1.0, 1.0) * between[..., :3]
+
+
+def of_rotation_vector(turn: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
+    """The rotation by a vector [rad]; smooth at zero."""
+    square = jnp.sum(turn**2, axis=-1, keepdims=True)
+    small = square < 1e-8
+    half = 0.5 * jnp.sqrt(jnp.where(small, 1.0, square))
+    share = jnp.where(small, 0.5 - square / 48.0, 0.5 * jnp.sin(half) / half)
+    cosine = jnp.where(small, 1.0 - square / 8.0, jnp.cos(half))
+    return jnp.concatenate([share * turn, cosine], axis=-1)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries
-from rfdropo_bayes.bayes.channels.quaternions import of_rotation_vector, product, turn_between
+from rfdropo_bayes.bayes.channels.object_pose import of_rotation_vector, product, turn_between
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -112,16 +111,6 @@ class Orientation(WhiteSeries):
         """See `Series.deviation`: turns in the measuring frame [rad]."""
         turns = turn_between(_quaternions(about), _quaternions(measured))
         return turns.reshape(*turns.shape[:2], -1)
-
-    def draw_errors(self, key: PRNGKeyArray, values: Mapping[str, Any]) -> Float[Any, "recording time column"]:
-        if self.known is not None:
-            return super().draw_errors(key, values)
-        return values[self.size.name] * jax.random.normal(key, self.valid.shape)
-
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time reading"]:
-        errors = self.draw_errors(key, seen.values)
-        turns = of_rotation_vector(errors.reshape(*errors.shape[:2], -1, 3))
-        return product(turns, _quaternions(self.expected(seen))).reshape(self.readings.shape)
 
     def mean(self, readings: Float[np.ndarray, "repeat time reading"], valid: Any) -> Float[np.ndarray, "time reading"]:
         """See `Series.mean`: of quaternions, which have two signs, the sum towards the first, of unit length."""

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Bool, Float, Int
 
 from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries, padded_readings
 from rfdropo_bayes.data import Trajectory
@@ -106,11 +106,6 @@ class Tension(WhiteSeries):
         self, about: Float[Any, "recording time cable"], measured: Float[Any, "recording time cable"]
     ) -> Float[Any, "recording time cable"]:
         return jnp.log(reading_size(about, self.valid, measured))
-
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Any, "recording time cable"]:
-        clean = self.expected(seen)
-        error = self.draw_errors(key, seen.values)
-        return jnp.where(self.valid, clean + error * reading_size(clean, self.valid, clean), 0.0)
 
 
 def reading_size(

@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from rfdropo_bayes.bayes.channels.channel import Channel, Seen
 from rfdropo_bayes.errors import InputError
@@ -75,9 +74,6 @@ class WeighedParts(Channel):
     def row_log_density(self, seen: Seen, measured: Float[Any, " weighed"]) -> Float[Array, " 1"]:
         normaliser = np.sum(np.log(self._sd * np.sqrt(2.0 * np.pi)))
         return (-0.5 * jnp.sum(self.residuals(seen, measured) ** 2) - normaliser)[None]
-
-    def draw(self, key: PRNGKeyArray, seen: Seen) -> Float[Array, " weighed"]:
-        return self._sums(seen.values) + self._sd * jax.random.normal(key, (len(self.entries),))
 
 
 def _inferred_name(name: str, inferred: Sequence[ParameterInfo]) -> str:

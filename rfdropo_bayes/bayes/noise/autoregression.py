@@ -116,7 +116,7 @@ class Autoregression:
             given["source"],
             np.inf if freedom is None else freedom,
             None if across is None else np.array(across),
-            given.get("step"),  # missing in earlier versions
+            given["step"],
         )
 
     @cached_property
@@ -240,14 +240,6 @@ class Autoregression:
         before = jnp.zeros((coefficients.shape[1], len(self.scale)))
         rows_of = (jnp.asarray(coefficients)[memory], jnp.asarray(deviation)[memory], white)
         return self.scale * jax.lax.scan(advance, before, rows_of)[1]
-
-    def draw_recordings(self, key: PRNGKeyArray, count: int, rows: int) -> Float[jax.Array, "recording time column"]:
-        """Realisations in several recordings."""
-        keys = jax.random.split(key, count)
-        if self.paces is None or self.step is None:
-            return jax.vmap(lambda k: self.draw_rows(k, rows))(keys)
-        times = self.step * np.outer(self.paces, np.arange(rows))
-        return jax.vmap(lambda k, time: self.draw_rows(k, rows, time))(keys, jnp.asarray(times))
 
     def draw(self, rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "*batch time column"]:
         """A realisation of shape (..., time, column), stationary from its first row on."""
