@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
-from rfdropo_bayes.discrepancy.repairs import optimised_again, paying_pair, without_needless
+from rfdropo_bayes.discrepancy.repairs import optimised_again, paying_pair, simplified
 from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
 
 
@@ -124,7 +124,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
             if pair:
                 named = named.extended([*named.steps, *pair])
                 yield named
-                named = without_needless_steps(named)
+                named = with_simpler_steps(named)
                 continue
             if step is None:
                 return
@@ -136,12 +136,12 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
                 continue
             named = named.with_best()
             yield named
-            named = without_needless_steps(named)
+            named = with_simpler_steps(named)
 
 
-def without_needless_steps(named: Named) -> Named:
-    """The model without steps that later steps made redundant."""
-    return named.extended(without_needless(named.asked, named.base, named.steps))
+def with_simpler_steps(named: Named) -> Named:
+    """The model without steps that later steps made redundant or simpler."""
+    return named.extended(simplified(named.asked, named.base, named.steps))
 
 
 def without_each_other(steps: Sequence[Added]) -> tuple[Added, ...]:

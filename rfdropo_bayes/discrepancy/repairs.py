@@ -2,8 +2,9 @@
 
 `paying_pair`, if the best step leaves more than twice the noise's variance: compliance and pretension of cables pay
     only together. `optimised_again`, before a step joins: a candidate must not be named for an effect of base
-    parameters, or for continuing an optimisation that stopped early. `without_needless`, after a further step: a first
-    lag may vanish after a delay and another lag are found, since a mixture of two causes may be named before either.
+    parameters, or for continuing an optimisation that stopped early. `simplified`, after a further step: a mixture of
+    two causes may be named before either. A first lag may vanish after a delay and another lag are found; a gain of
+    each cable may be a gain of all cables after a rotation of the camera is found.
 
 Two more concern single refits, see `ExtensionSearch`: all sizes of an amplitude are tried, as time shifts have an
 optimum at every jump of a command; and a misspecified model is also optimised from a distant start.
@@ -16,12 +17,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rfdropo_bayes.discrepancy.candidates import start_together
+from rfdropo_bayes.discrepancy.candidates import probe_all, start_together
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, WIDER, Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import Fit, best_between, heights, optimise
 from rfdropo_bayes.discrepancy.inadequacy import misspecified
 from rfdropo_bayes.discrepancy.score import joint_statistic
-from rfdropo_bayes.discrepancy.score_tests import ScoreTests
+from rfdropo_bayes.discrepancy.score_tests import ScoreTests, run_score_tests
 
 PAIRS = 3  # that are refitted
 
@@ -96,26 +97,60 @@ def optimised_again(search: ExtensionSearch, step: Added) -> Fit | None:
     return again if again.log_evidence > before.log_evidence + 1.0 else None
 
 
-def without_needless(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tuple[Added, ...]:
-    """Steps without redundant steps: the last model has equal evidence without their parameters."""
+def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tuple[Added, ...]:
+    """Steps without redundant steps, whose parameters the last model does not need for its evidence, and with a simpler
+    candidate in the place of a step if its evidence is larger.
+
+    A candidate is simpler if it has fewer parameters. It was refitted in the same step, before the later steps took
+    their part of the effect. If its evidence is nearly as large, it joins the class of the step.
+    """
     if len(steps) < 2:
         return tuple(steps)
     last, null = steps[-1], search.target.forward.coordinates.null
     for index in range(len(steps) - 1):
-        if steps[index].name == DISCRETISATION:
+        step = steps[index]
+        if step.name == DISCRETISATION:
             continue
         before = steps[index - 1].fit if index else base
-        gone = np.setdiff1d(steps[index].fit.free, before.free)
+        gone = np.setdiff1d(step.fit.free, before.free)
+        names = {each.name for each in steps}
+        simpler = [
+            c
+            for c in search.candidates
+            if c.name in step.refits and c.name not in names and len(np.setdiff1d(c.indices, before.free)) < len(gone)
+        ]
         emptied = last.fit.x.copy()
         emptied[gone] = null[gone]
         place = [int(np.flatnonzero(last.fit.free == index)[0]) for index in gone]
         apart = last.fit.x[gone] - emptied[gone]
         covariance = last.fit.covariance[np.ix_(place, place)]
-        if 0.5 * float(apart @ np.linalg.solve(covariance, apart)) > TOLD_APART:  # the least loss [nat]
+        needed = 0.5 * float(apart @ np.linalg.solve(covariance, apart)) > TOLD_APART  # the least loss [nat]
+        if needed and not simpler:
             continue
-        if optimise(last.fit_target, emptied, np.setdiff1d(last.fit.free, gone)).log_evidence >= last.fit.log_evidence:
-            search.report(f"{steps[index].name} is no longer needed")
-            return without_needless(search, base, without(search, steps, index, base))
+        empty = optimise(last.fit_target, emptied, np.setdiff1d(last.fit.free, gone))
+        if empty.log_evidence >= last.fit.log_evidence:
+            search.report(f"{step.name} is no longer needed")
+            return simplified(search, base, without(search, steps, index, base))
+        probes = probe_all(search.target, empty, simpler)
+        tests = run_score_tests(
+            search.target, empty, probes, [c.name for c in simpler], [search.seed, index], search.rules.bootstraps
+        )
+        fits = {row.name: search.refit(empty, row) for row in tests.rows if row.probe is not None}
+        best = max(fits, key=lambda name: fits[name].log_evidence, default=None)
+        if best is None:
+            continue
+        gains = {name: fit.log_evidence - empty.log_evidence for name, fit in fits.items()}
+        own, rules = last.fit.log_evidence - empty.log_evidence, search.rules
+        tied = [name for name in gains if gains[name] > max(own, gains[best]) - rules.evidence]
+        if gains[best] > own:
+            search.report(f"{best} takes the place of {step.name}")
+            members = (best, *(name for name in tied if name != best))
+            members += (step.name,) if own > gains[best] - rules.evidence else ()
+            place = Added(best, members, tests, fits[best], gains[best], gains, last.fit_target)
+            return simplified(search, base, (*without(search, steps, index, base), place))
+        if further := [name for name in tied if name not in step.members]:
+            kept = replace(step, members=(*step.members, *further))
+            steps = (*steps[:index], kept, *steps[index + 1 :])
     return tuple(steps)
 
 
