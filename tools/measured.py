@@ -1,0 +1,156 @@
+"""Write docs/measured.md from tools/measured.md.j2 and the ledgers of the studies and benchmarks.
+
+python tools/measured.py            # write the page
+python tools/measured.py --check    # end with status 1 if the page is not what the ledgers say
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from scipy.stats import binomtest
+
+from rfdropo_bayes.files import read_lines
+from studies.table2 import share_of
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+REPORTS = REPOSITORY / "reports"
+PAGE = REPOSITORY / "docs" / "measured.md"
+REACHED = 15.25  # mm: how near an episode of the paper's tasks has to end
+
+
+def counted(found: int, of: int) -> dict[str, Any]:
+    """A share in words, with its exact 95 % interval in percent."""
+    interval = binomtest(found, of).proportion_ci(0.95, method="exact")
+    return {"words": f"{found} of {of}", "interval": f"{100 * interval.low:.0f} to {100 * interval.high:.0f} %"}
+
+
+def two_figures(value: float) -> str:
+    """A positive number with two figures, or whole."""
+    return f"{value:.2g}" if value < 10.0 else f"{value:.0f}"
+
+
+def robots() -> dict[str, Mapping[str, Any]]:
+    """Lines of `benchmarks/robots.py` by run."""
+    return {line["run"]: line for line in read_lines(REPORTS / "robots" / "ledger.jsonl")}
+
+
+def days() -> dict[str, dict[float, Mapping[str, Any]]]:
+    """Lines of `benchmarks/leave_out.py` by its pattern, without an asterisk, and the seconds that were shown: smallest
+    and largest error [mm] of the recordings that were not shown.
+    """
+    found: dict[str, dict[float, Mapping[str, Any]]] = {}
+    for line in read_lines(REPORTS / "leave_out" / "rod.jsonl"):
+        rows = list(line["recordings"].values())
+        rows = rows[1:] if line["seconds"] and len(rows) > 1 else rows
+        ends = {
+            f"{key}_{end}": of(row[f"{key}_mm"] for row in rows)
+            for key in ("error", "held")
+            for end, of in (("low", min), ("high", max))
+        }
+        found.setdefault(line["left_out"].replace("*", ""), {})[line["seconds"]] = {"recordings": len(rows), **ends}
+    return found
+
+
+def audits(*ledgers: str) -> dict[str, Mapping[str, Any]]:
+    """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``)."""
+    lines = [line for ledger in ledgers for line in read_lines(REPORTS / ledger)]
+    right: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
+        "null": lambda result: result["verdict"] == "no_discrepancy",
+        "removed": lambda result: result["verdict"] not in ("explained", "equivalent"),
+        "two": lambda result: result["all_named"],
+        "rho": lambda result: result["named_first"],
+        "rest": lambda result: result["named_first"],
+    }
+    shares, held = {}, []
+    for condition in {line["job"]["condition"] for line in lines}:
+        results = [line["result"] for line in lines if line["job"]["condition"] == condition]
+        answers = [right[condition.split("_")[0]](result) for result in results]
+        shares[condition] = counted(sum(answers), len(answers))
+        held += [held for r in results for name, held in r["covered"].items() if name not in r["undetermined"]]
+    return {**shares, "sizes": counted(sum(held), len(held))}
+
+
+def sizes() -> Mapping[str, Any]:
+    """Share of 90 % intervals that hold the size, given the right cause."""
+    learnt = [size for line in read_lines(REPORTS / "size_coverage" / "rod.jsonl") for size in line["sizes"]]
+    return counted(sum(abs(size["deviations"]) <= 1.645 for size in learnt), len(learnt))
+
+
+def table1(folder: str) -> dict[str, Mapping[str, Any]]:
+    """Cells of Table I whose truths are off the centre, by task and row."""
+    content = json.loads((REPORTS / "table1" / folder / "table1.json").read_text(encoding="utf-8"))
+    return {f"{cell['task']} {cell['row']}": cell for cell in content["cells"] if cell["truths"] == "off-centre"}
+
+
+def policies(folder: str, within: float = REACHED) -> dict[str, str]:
+    """Share of episodes that end within a distance [mm] by row, of all its trainings, with a 95 % interval."""
+    episodes: dict[str, list[np.ndarray]] = {}
+    for file in sorted((REPORTS / folder / "evaluations").glob("*/episodes.csv")):
+        hits = 1e3 * pd.read_csv(file)["distance"].to_numpy() <= within
+        episodes.setdefault(file.parent.name.rsplit("_", 1)[0], []).append(hits)
+    shares = {row: share_of(np.array(hits)) for row, hits in episodes.items()}
+    return {
+        row: f"{100 * share['share']:.0f} % [{100 * share['low']:.0f}, {100 * share['high']:.0f}]"
+        for row, share in shares.items()
+    }
+
+
+def sbc() -> dict[str, float]:
+    """Shares of 90 % intervals that hold parameters of the body, and of the noise [%], and the number of data sets."""
+    content = json.loads((REPORTS / "sbc" / "seed_3.json").read_text(encoding="utf-8"))
+    shares = {name: 100.0 * row["coverage_90"] for name, row in content["quantities"].items() if row["coverage_90"]}
+    noise = [share for name, share in shares.items() if "noise" in name]
+    body = [share for name, share in shares.items() if "noise" not in name]
+    return {"body": float(np.mean(body)), "noise": float(np.mean(noise)), "datasets": content["datasets"]}
+
+
+def sofa() -> float:
+    """Largest distance from SOFA's recordings [mm]."""
+    content = json.loads((REPORTS / "validation" / "validation.json").read_text(encoding="utf-8"))
+    found = [row["found"] for row in content["references"] if row["quantity"].endswith("max error [mm]")]
+    return max(found)
+
+
+def page() -> str:
+    """The text of docs/measured.md."""
+    rates = json.loads((REPORTS / "rollouts" / "device_h200.json").read_text(encoding="utf-8"))["rows"]
+    words = Environment(
+        loader=FileSystemLoader(REPOSITORY / "tools"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    words.filters["mm"] = two_figures
+    return words.get_template("measured.md.j2").render(
+        robots=robots(),
+        days=days(),
+        rest=audits("audit_rest/datasets.jsonl", "audit_rest/seeds_1000_1012.jsonl"),
+        motion=audits("audit_power/rod/datasets.jsonl"),
+        sizes=sizes(),
+        reach=table1(""),
+        push=table1("push_20"),
+        policies=policies,
+        sbc=sbc(),
+        sofa=sofa(),
+        rates=rates,
+    )
+
+
+def main() -> None:
+    """Write the page, or compare it."""
+    text = page()
+    if "--check" in sys.argv[1:]:
+        sys.exit(PAGE.read_text(encoding="utf-8") != text)
+    PAGE.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
