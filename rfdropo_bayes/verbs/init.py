@@ -37,6 +37,7 @@ NO_TIMES = "no column was recognised as times; give --sample-time if rows are ev
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
 READ = "the commands are readings of the drives, taken with the pose of their row"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)  # formats that come from motion capture, which loses markers now and then
+FORCES = (0.2, 2.5)  # least and largest force of a command over an assumed force
 FAR_ORIGIN = 0.1  # share of the body's length: a frame whose origin lies farther from the base is moved there
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
@@ -176,9 +177,13 @@ def write_first_files(
     made = Robot.load(robot)
 
     def write(
-        data: list[str], slow: str | None = None, first: Trajectory | None = None, seen: Frame | None = None
+        data: list[str],
+        slow: str | None = None,
+        first: Trajectory | None = None,
+        seen: Frame | None = None,
+        gain: float = 1.0,
     ) -> Experiment:
-        model = _model(made, outline, guess, first, seen, rests=slow is not None)
+        model = _model(made, outline, guess, first, seen, gain, rests=slow is not None)
         lines = [*_head(outline.name), *data, *_simulator(slow), *model, *group_lines(days)]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
@@ -255,7 +260,8 @@ def write_first_files(
             lines = moved_frame(columns, turned, -turned @ registration.frame.shift)
             frame = [f"{line}  # ASSUMED: {explained} in this frame" for line in lines]
             registration = registration._replace(frame=registration.frame._replace(shift=np.zeros(3)))
-    write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame)
+    gain = float(np.clip(registration.bend / registration.softness, *FORCES))
+    write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame, gain)
     return robot, experiment
 
 
@@ -479,6 +485,7 @@ def _model(
     guess: Guess | None,
     first: Trajectory | None,
     seen: Frame | None,
+    gain: float,
     *,
     rests: bool,
 ) -> list[str]:
@@ -503,7 +510,7 @@ def _model(
         "",
         "[model.priors]          # inferred parameters; {} asks for the prior of the robot file or of the mechanism",
         *wanted,
-        *installed_priors(robot, first, seen, outline.assumed),
+        *installed_priors(robot, first, seen, outline.assumed, gain),
         "",
         "[inference]",
         'method = "laplace"      # rfdropo methods lists them',
