@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,11 +32,13 @@ from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_pri
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
-from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
+from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
 READ = "the commands are readings of the drives, taken with the pose of their row"
+NAMED = re.compile(r"motor|servo|joint|theta|angle|enc|pull|cable|tendon|length|travel|displ|pos|wire", re.IGNORECASE)
+"""Names of commands that are lengths of cable or angles of motors."""
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)  # formats that come from motion capture, which loses markers now and then
 FORCES = (0.2, 2.5)  # least and largest force of a command over an assumed force
 FAR_ORIGIN = 0.1  # share of the body's length: a frame whose origin lies farther from the base is moved there
@@ -149,6 +152,24 @@ def _moved(guess: Guess, outline: RobotOutline) -> Guess:
     guessed = Unit(guess.command_unit, evidence=guess.evidence["command_unit"])
     unit = unit_of_motion(robot, guess.sent, seen, outline.markers, guessed)
     return guess._replace(command_unit=unit.unit, evidence={**guess.evidence, "command_unit": unit.evidence})
+
+
+def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutline]:
+    """A guess and a robot whose commands are inputs of drives of unknown force, such as pressures, if no name says that
+    they are lengths, and lengths would bend the robot much farther than its markers moved, even in millimetres."""
+    evidence = guess.evidence.get("command_unit", "")
+    named = guess.units or any(NAMED.search(name) for name in guess.commands)
+    if not evidence or named or outline.pairs or outline.command_unit != "m" or "markers" in outline.assumed:
+        return guess, outline
+    robot = parse_table(Robot, outlined_tables(outline), where="outline")
+    if len(guess.commands) != len(robot.channel_names) or len(guess.positions) != len(outline.markers):
+        return guess, outline
+    seen = METRES[guess.position_unit] * guess.seen
+    words = bends_too_far(robot, METRES["mm"] * guess.sent, seen, list(outline.markers.values()))
+    if words is None:
+        return guess, outline
+    said = {**guess.evidence, "command_unit": f"{evidence}; {words}: drives of unknown force, such as pressures"}
+    return guess._replace(command_unit="-", evidence=said), replace(outline, command_unit="-")
 
 
 def write_first_files(

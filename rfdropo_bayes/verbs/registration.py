@@ -42,7 +42,8 @@ TURNS = tuple(
     float(turn) for turn in np.arange(12) * 2.0 * np.pi / 12.0
 )  # turns of all cables about the axis of a body that lies [rad]
 SOFTNESS = tuple(np.geomspace(1.0 / 8.0, 8.0, 7))  # compliances that are tried if the stiffness was not given
-NOTHING = 1e3  # unexplained share of a turn at which the rod finds no equilibria
+MOST = np.log(16.0)  # largest logarithm of a factor
+NOTHING = 1e3  # unexplained share without equilibria
 MINIMA = 3  # turns from which the best is sought
 TURNED, SOFTER, EVALUATIONS = np.radians(15.0), 0.3, 10
 """First steps of the turn [rad] and of the logarithms of the factors, and the most evaluations for each corner of a
@@ -182,7 +183,7 @@ class _Sights:
         return [each for k in lowest[np.argsort(left[lowest])] if (each := sights[k]) is not None]
 
     def near(self, sight: _Sight, *, turning: bool = True) -> _Sight | None:
-        """The best sight in all rows; of a body that lies, of factors, and turns if ``turning``, near those of a sight."""
+        """The best sight in all rows; of a body that lies, of factors, and turns if asked, near those of a sight."""
         if not self.lies:
             return self.whole(sight.arrangement)
         sights: list[_Sight | None] = []
@@ -190,6 +191,8 @@ class _Sights:
         def unexplained(steps: Float[np.ndarray, " step"]) -> float:
             turn, *factor = steps @ directions
             factors = (float(np.exp(factor[0])) * sight.bend, float(np.exp(factor[1])) * sight.softness)
+            if np.abs(np.log(factors)).max() > MOST:
+                return NOTHING
             made = self.of(sight.arrangement.turned(float(turn)), self.rows, [factors])
             sights.append(made)
             return NOTHING if made is None else made.unexplained
