@@ -32,9 +32,8 @@ from rfdropo_bayes.discrepancy.fit import optimise
 from rfdropo_bayes.discrepancy.gain import Difference, Gain
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.measurements import gather_measurements
-from rfdropo_bayes.discrepancy.naming import Named, without_each_other
+from rfdropo_bayes.discrepancy.naming import Named, optimised_again, without_each_other, without_needless
 from rfdropo_bayes.discrepancy.pipeline import audit
-from rfdropo_bayes.discrepancy.repairs import optimised_again, without_needless
 from rfdropo_bayes.discrepancy.score_tests import p_in_words
 from rfdropo_bayes.discrepancy.sentence import _adoption, _named
 from rfdropo_bayes.discrepancy.verdict import decide

@@ -8,12 +8,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from rfdropo_bayes.discrepancy import naming, repairs
+from rfdropo_bayes.discrepancy import naming
 from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import optimise
+from rfdropo_bayes.discrepancy.naming import optimised_again
 from rfdropo_bayes.discrepancy.pipeline import audit
-from rfdropo_bayes.discrepancy.repairs import optimised_again
 
 from .toys import Geared, Opposed, problem_of
 
@@ -64,7 +64,7 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     gained = extended.log_evidence - stopped.log_evidence
     assert gained > 100.0
     step = Added("cable_gains", ("cable_gains",), replace(tests, fit=stopped), extended, gained, {}, target)
-    monkeypatch.setattr(repairs, "optimise", stuck)
+    monkeypatch.setattr(naming, "optimise", stuck)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
     again = optimised_again(search, step)
     assert again is not None
