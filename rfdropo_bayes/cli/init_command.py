@@ -219,13 +219,13 @@ def init(
     answers["segments"] = ask.answer("segments", segments, "Segments with their own cables", 1)
     if segment_lengths is None and answers["segments"] > 1:
         ask.assumed.add("segment_lengths")
-    if answers["segments"] > 1:
-        ask.assumed.add("segment_azimuths")
     answers["segment_lengths"] = _lengths(segment_lengths)
     answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
     if unit in (*ANGLES, "N m"):
         answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
     answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")
+    if answers["segments"] > 1 or not answers["gravity"].endswith("z"):
+        ask.assumed.add("segment_azimuths")
     answers["mass"] = ask.answer("mass", mass, "Mass of the body [g]; 0 for silicone", 0.0) or None
     answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
     answers["markers"] = _markers(ask, guess, markers, answers["length"])

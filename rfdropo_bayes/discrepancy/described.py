@@ -21,7 +21,8 @@ from rfdropo_bayes.discrepancy.gain import Gain
 from rfdropo_bayes.discrepancy.held_out import FittedModel, HeldOut, predicted, stages_of
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.law_search import LawResult, Refit, law_search
-from rfdropo_bayes.discrepancy.naming import Named, without
+from rfdropo_bayes.discrepancy.naming import Named
+from rfdropo_bayes.discrepancy.repairs import without
 
 UNSUPPORTED = 2
 """Terms in a row without the support of unseen recordings that end a search for a law."""

@@ -17,8 +17,9 @@ from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.discrepancy.inadequacy import as_measured, residual_deviation
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.discrepancy.naming import Named, without
+from rfdropo_bayes.discrepancy.naming import Named
 from rfdropo_bayes.discrepancy.port_rollouts import with_laws_of
+from rfdropo_bayes.discrepancy.repairs import without
 from rfdropo_bayes.errors import NoLikelihoodError
 
 DRAWS = 60

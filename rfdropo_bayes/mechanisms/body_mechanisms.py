@@ -382,7 +382,7 @@ class CableCompliance:
     remedy = "hang a known weight on each cable and measure its stretch; use stiffer cable"
     parameters = (
         ParameterSpec(
-            "cable_compliance", "m/N", 0.0, 0.1, 0.0, half_normal(5e-4), "stretch of every cable per tension"
+            "cable_compliance", "m/N", 0.0, 0.1, 0.0, half_normal(1e-3), "stretch of every cable per tension"
         ),
     )
 

@@ -7,6 +7,7 @@ each recording or group a size.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import jax
@@ -19,7 +20,7 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
-USUAL = 10.0  # [s] in which a size of its prior's scale comes about
+USUAL = 10.0  # duration [s] of the recordings that default priors are given for, see `rates_over`
 RATE = "_rate"
 
 
@@ -61,6 +62,18 @@ class Drift:
             size = spec.nominal + values[spec.name + RATE] * elapsed
             sizes[spec.name] = jnp.where(size < spec.low, spec.low, jnp.where(size > spec.high, spec.high, size))
         return sizes
+
+
+def rates_over(duration: float, specs: Iterable[ParameterSpec], mechanisms: Iterable[Any]) -> tuple[ParameterSpec, ...]:
+    """Parameters of a model with priors of rates by which sizes change, over a duration [s], by the scale of their own
+    prior.
+    """
+    rates = {spec.name for each in mechanisms if isinstance(each, Drift) for spec in each.parameters}
+    share = USUAL / duration
+    return tuple(
+        spec._replace(prior={**spec.prior, "scale": share * spec.prior["scale"]}) if spec.name in rates else spec
+        for spec in specs
+    )
 
 
 class ActuationDrift(Drift, SteppedActuation):

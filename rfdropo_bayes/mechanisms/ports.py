@@ -20,7 +20,7 @@ from rfdropo_bayes.simulators.port_signals import BodySignals, PortSignals
 AXES = "xyz"
 SIZES = {"m": 1e-3, "rad": 0.05}
 """Size of an effect on a command, by unit."""
-FORCE, LENGTH = 1.25e-3, 5e-3
+FORCE, LENGTH = 5e-3, 5e-3
 """Sizes of a force over the tension that bends the robot by a usual pull, and of a shift over its length."""
 SHARE = 0.05
 """Size of an effect in other units, as a share of usual commands."""

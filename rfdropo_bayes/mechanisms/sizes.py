@@ -2,8 +2,9 @@
 
 A play of half a millimetre is much for a robot that pulls eight, and nothing for a robot that pulls eighty. Cable
 lengths scale with the pull of usual commands, other lengths with the body's length, and masses with the body's mass.
-Forces scale with ``E I pull / (length radius^2)``, the tension (or thrust of a chamber) that bends the body by a usual
-pull. Times, angles and ratios stay, and so does the density of a fluid around the body.
+Forces scale with the tension (or thrust of a chamber) that bends the body by a usual pull: the pull times Young's
+modulus over the integral of ``radius^2 / I`` along the cable. Times, angles and ratios stay, and so does the density of
+a fluid around the body.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class Scales(NamedTuple):
     force: float  # tension that bends the body by a usual pull [N]
 
 
-USUAL = Scales(pull=0.03, length=0.2, mass=0.2, force=40.0)
+USUAL = Scales(pull=0.03, length=0.2, mass=0.2, force=10.0)
 """A silicone trunk, for which the library's numbers are given."""
 POWERS: dict[str, Scales] = {
     "m": Scales(0, 1, 0, 0),
@@ -43,16 +44,15 @@ WITH_UNIT = ("loc", "scale", "median", "low", "high")
 def scales_of(robot: Robot) -> Scales:
     """Scales of a robot at nominal parameters."""
     nominal = robot.nominal()
-    rigidity = nominal["young_modulus"] * float(np.mean(robot.body.bending_moment_area_m4))
-    middles = [*robot.guides(), *(chamber.ends() for chamber in robot.chambers)]
-    arm = float(np.mean([np.hypot(*middle[:, :2].T).mean() for middle in middles]))
+    courses = [*robot.guides(), *(chamber.ends() for chamber in robot.chambers)]
+    give = float(np.mean([robot.body.shortening(course) for course in courses])) / nominal["young_modulus"]
     if robot.held_by_force:
         areas = np.array([1.0] * len(robot.cables) + [chamber.area_m2 for chamber in robot.chambers])
         force = robot.usual_command * float((areas @ np.abs(np.asarray(robot.channel_matrix(nominal)))).max())
-        pull = force * robot.length * arm**2 / rigidity
+        pull = force * give
     else:
         pull = robot.usual_command * float(np.abs(np.asarray(robot.channel_matrix(nominal))).max())
-        force = rigidity * pull / (robot.length * arm**2)
+        force = pull / give
     return Scales(pull, robot.length, nominal["trunk_mass"], force)
 
 

@@ -42,6 +42,7 @@ from rfdropo_bayes.data import DataSpec, Trajectory, find_data_file, load_record
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups
 from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms.drift import rates_over
 from rfdropo_bayes.mechanisms.laws import LawChoice, make_law
 from rfdropo_bayes.mechanisms.ports import port_map
 from rfdropo_bayes.mechanisms.registry import REGISTRY
@@ -334,9 +335,13 @@ def build_model(
         InputError: unknown names, priors outside the bounds, a parameter both fixed and inferred.
     """
     recordings = gather_recordings(simulator, trajectories)
-    count, chosen = len(trajectories) if fitted is None else fitted, model_specs(spec, simulator)
+    count = len(trajectories) if fitted is None else fitted
+    longest = max(float(run.time[-1] - run.time[0]) for run in trajectories[:count])
+    chosen = model_specs(spec, simulator) if specs is None else specs
+    if longest > 0.0:
+        chosen = rates_over(longest, chosen, simulator.mechanisms)
     groups = recordings.names[:count], recordings.names[count:]
-    scopes = model_scopes(spec, simulator, chosen if specs is None else specs, *groups, later)
+    scopes = model_scopes(spec, simulator, chosen, *groups, later)
     channels = gather_channels(spec, simulator, trajectories, recordings, scopes.infos, fitted)
     return TrajectoryModel(simulator, scopes, recordings, channels)
 

@@ -104,6 +104,14 @@ class Body(RobotTable):
         """Volume of all layers [m3]; the rest of ``volume_m3`` is held by the clamp."""
         return float(np.sum(np.diff(self.station_m) * np.array(self.mass_area_m2)))
 
+    def shortening(self, course: Float[np.ndarray, "guide 3"]) -> float:
+        """How much a cable through guides [m] is wound in per unit of its tension, times Young's modulus, as the body
+        bends a little [1/m]: stiff disks on a thin backbone hardly count."""
+        station, moment = np.array(self.station_m), np.array(self.bending_moment_area_m4).mean(axis=1)
+        passed = np.clip(station, course[0, 2], course[-1, 2])
+        radius = np.interp(0.5 * (passed[1:] + passed[:-1]), course[:, 2], np.hypot(course[:, 0], course[:, 1]))
+        return float(np.sum(radius**2 * np.diff(passed) / moment))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """The sections of a rod for the finite-element engine, in SI units."""
         return {

@@ -173,8 +173,9 @@ class RobotOutline:
     @property
     def bending_force(self) -> float:
         """Tension, or thrust of a chamber, that bends the body by a usual pull [N], see `mechanisms.sizes`."""
-        moment = float(np.mean(section_profile([self.section]).bending_moment_area_m4))
-        return self.young_modulus * moment * USUAL_PULL / self.arm**2
+        ends = np.array([[self.arm, 0.0, 0.0], [self.arm, 0.0, self.length]])
+        give = section_profile([self.section]).shortening(ends)
+        return self.young_modulus * USUAL_PULL * self.length / give
 
     @property
     def sets_bend(self) -> str | None:
@@ -184,12 +185,13 @@ class RobotOutline:
         )
         return next((name for name in names if name in self.assumed), None)
 
-    def resized(self, scale: float, bend: float, evidence: str) -> RobotOutline:
+    def resized(self, scale: float, bend: float, softness: float, evidence: str) -> RobotOutline:
         """The robot in the size that a recording shows.
 
         Args:
             scale: factor of the lengths that were assumed.
             bend: factor of the bend of a command, by the attribute that `sets_bend`.
+            softness: factor of the bend under the weight, of drives that impose lengths.
             evidence: reason for length and radius, in words.
         """
         lengths = ("length", "radius", "tip_radius", "inner_radius")
@@ -202,6 +204,8 @@ class RobotOutline:
             changes["markers"] = {name: _rounded(scale * height) for name, height in self.markers.items()}
         if {"radius", "cable_radius"} <= self.assumed:
             changes["cable_radius"] = None  # it follows the body
+        if softness != 1.0:
+            changes["young_modulus"] = _rounded(self.young_modulus * scale / softness)
         sized = replace(self, **changes, size_evidence=evidence)
         if self.sets_bend == "spool_radius":
             return replace(sized, spool_radius=_rounded(self.spool_radius * bend * sized.arm / self.arm))
@@ -262,7 +266,9 @@ def not_given(answers: Mapping[str, Any]) -> frozenset[str]:
     needless = {"assumed", "usual_command", "azimuth_evidence", "size_evidence"} | (
         {"disks"} if answers.get("shape") != "disks" else set()
     )
-    needless |= {"segment_lengths", "segment_azimuths"} if answers.get("segments", 1) == 1 else set()
+    needless |= {"segment_lengths"} if answers.get("segments", 1) == 1 else set()
+    lies = not answers.get("gravity", "+z").endswith("z")
+    needless |= {"segment_azimuths"} if answers.get("segments", 1) == 1 and not lies else set()
     return frozenset(field.name for field in fields(RobotOutline) if field.name not in answers) - needless
 
 
@@ -348,7 +354,7 @@ def _cables(o: RobotOutline) -> list[str]:
     names = o.cable_names()
     for row in range(o.segments * o.cables):
         segment, cable = divmod(row, o.cables)
-        azimuth = 360.0 / o.cables * cable + o.first_azimuths()[segment]
+        azimuth = (360.0 / o.cables * cable + o.first_azimuths()[segment]) % 360.0
         inside = heights <= o.end_of_cables(segment) + 1e-9
         lines += [
             "[[cables]]",

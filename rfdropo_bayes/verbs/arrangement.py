@@ -33,6 +33,10 @@ class Arrangement(NamedTuple):
         """These columns with the other sign."""
         return self._replace(signs=tuple(-s if k in columns else s for k, s in enumerate(self.signs)))
 
+    def turned(self, angle: float) -> Arrangement:
+        """All sections turned about +z by one more angle [rad]."""
+        return self._replace(turns=tuple(turn + angle for turn in self.turns))
+
 
 def as_written(channels: int, sections: int) -> Arrangement:
     """Columns in their order, cables as described."""

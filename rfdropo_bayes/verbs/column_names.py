@@ -110,6 +110,11 @@ class Guess(NamedTuple):
     unwrap: Mapping[str, float] = {}  # turn of each counter that begins anew in the first rows, by its column
 
     @property
+    def reads_drives(self) -> bool:
+        """Whether the commands are readings of the drives, which were taken with the poses."""
+        return all(MEASURED.search(name) and not SENT.search(name) for name in self.commands)
+
+    @property
     def counts(self) -> bool:
         """Whether a unit is a unit of counts."""
         return named_columns.COUNTS in (self.command_unit, self.motor_angle_unit if self.motor_angles else "")

@@ -35,6 +35,7 @@ from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
+READ = "the commands are readings of the drives, taken with the pose of their row"
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)  # formats that come from motion capture, which loses markers now and then
 FAR_ORIGIN = 0.1  # share of the body's length: a frame whose origin lies farther from the base is moved there
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
@@ -213,7 +214,8 @@ def write_first_files(
         if len(runs) == len(recordings)
         else None
     )
-    poses = _of_poses(first, timed) if slow is not None and guess.command_time is None else None
+    poses = READ if guess.reads_drives else None if slow is None else _of_poses(first, timed)
+    poses = None if guess.command_time is not None else poses
     tables = partial(tables, pieces=pieces, poses=poses)
     placed = write(tables(frame=frame), slow, first)
     runs = _recordings(placed, folder)
@@ -222,7 +224,8 @@ def write_first_files(
         return robot, experiment
     seen = runs[0]
     bends = outline.sets_bend is not None
-    registration = register(spec_of(placed, folder), seen, scaled="length" in outline.assumed, bends=bends)
+    scaled, stiff = ("length" in outline.assumed), ("young_modulus" in outline.assumed)
+    registration = register(spec_of(placed, folder), seen, scaled=scaled, bends=bends, stiff=stiff)
     ordered, order = guess, None
     if registration.arrangement is not None:
         turns = np.degrees(registration.arrangement.turns)
@@ -241,8 +244,9 @@ def write_first_files(
         if registration.frame is None
         else f"a rod at rest explains {100 * registration.frame.explained:.3g} % of the motion"
     )
-    if registration.frame is not None and (registration.frame.scale, registration.bend) != (1.0, 1.0):
-        outline = outline.resized(registration.frame.scale, registration.bend, f"{explained} with them")
+    if registration.frame is not None:
+        sizes = (registration.frame.scale, registration.bend, registration.softness)
+        outline = outline if sizes == (1.0, 1.0, 1.0) else outline.resized(*sizes, f"{explained} with them")
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
     if registration.frame is not None:

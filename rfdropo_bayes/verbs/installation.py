@@ -14,7 +14,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.mechanisms.sizes import scales_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import sections_of
-from rfdropo_bayes.verbs.registration import Frame
+from rfdropo_bayes.verbs.registration import Frame, lies
 
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
@@ -38,17 +38,28 @@ def largest_pull(robot: Robot, recording: Trajectory) -> float:
 
 def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[str]:
     """Mechanisms of the base model: the measuring frame, the body's stiffness in tension, the gain of the drives, the
-    scale of lengths if the body's length was ``assumed``, and of a robot with several sections, whose cables pull
-    against each other and whose sections are turned by hand, the stretch and the azimuths of its cables."""
+    scale of lengths if the body's length was ``assumed``, the stretch of cables that pull against each other, and of a
+    robot with several sections, which are turned by hand, the azimuths of its cables. Gravity turns about the axis of a
+    body that lies, if the azimuths of its cables were assumed."""
     gain = ["command_gain"] if robot.command_unit in ("m", *UNSTATED) else []
     scale = ["camera_scale"] if "length" in assumed else []
-    sections = ["cable_compliance", "guide_azimuth"] if _pulled_by_section(robot) else []
-    return ["axial_stiffness", "camera_rotation", *gain, *scale, *sections]
+    stretch = ["cable_compliance"] if _pulled_by_section(robot) or _hardly_shortens(robot) else []
+    sections = ["guide_azimuth"] if _pulled_by_section(robot) else []
+    tilt = ["base_tilt"] if lies(robot) and "segment_azimuths" in assumed else []
+    return ["axial_stiffness", "camera_rotation", *gain, *scale, *stretch, *sections, *tilt]
 
 
 def _pulled_by_section(robot: Robot) -> bool:
     """Whether cables of imposed lengths end at several heights."""
     return robot.actuators[0].unit == "m" and sections_of(robot).number > 1
+
+
+def _hardly_shortens(robot: Robot) -> bool:
+    """Whether zeros of cables of imposed lengths would press a body, such as a metal backbone, by more than the tension
+    that bends it: the cables stretch instead."""
+    sizes, length = scales_of(robot), np.diff(robot.body.station_m)
+    give = float(np.sum(length / np.array(robot.body.axial_area_m2))) / robot.nominal()["young_modulus"]
+    return robot.actuators[0].unit == "m" and ZERO * sizes.pull > give * sizes.force
 
 
 def installed_priors(
@@ -78,6 +89,8 @@ def installed_priors(
         normal(f"offset_{axis}", ORIGIN * robot.length, words, place)
     for axis, angle, wide in zip("xyz", turn, (TILT, TILT, TURN), strict=True):
         normal(f"camera_rotation_{axis}", wide, f"turn of the measuring frame{explained}", angle)
+    if lies(robot) and "segment_azimuths" in assumed:
+        normal("base_tilt", TILT, "direction of gravity, about the axis and along it")
     if robot.command_unit == "m":
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
@@ -85,8 +98,9 @@ def installed_priors(
         normal("command_gain_error", UNKNOWN, "force of a drive over that of the robot file, less 1")
     if "length" in assumed:
         normal("camera_scale_error", UNKNOWN, "lengths over the robot file's lengths, less 1")
-    if _pulled_by_section(robot):
+    if _pulled_by_section(robot) or _hardly_shortens(robot):
         lines.append("cable_compliance = {}  # stretch of a cable over its tension")
+    if _pulled_by_section(robot):
         wide, words = (TURN, "which was not given") if "segment_azimuths" in assumed else (TILT, "over the drawing's")
         normal("guide_azimuth_error", wide, f"azimuth of the cables of a channel, {words}")
     lines.append("axial_stiffness = {}  # in tension, over that which the profile has for its bending")

@@ -3,17 +3,19 @@
 A rod at rest under the recorded commands is compared with the measured positions. Cables are arranged by
 `order_finder`, or with two of them exchanged; the frame is the rotation, the shift and, for a body of unknown length,
 the scale that bring the rod to the measured positions (Kabsch 1976, Umeyama 1991). If the size that turns a command
-into a bend was not given, several are tried: the form of the motion shows how far the body bends.
+into a bend was not given, several are tried: the form of the motion shows how far the body bends. The weight of a body
+that lies bends it as well, so the cables are turned about the axis until the bends by cables and by weight fit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data import Trajectory
@@ -21,7 +23,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import Arrangement, as_written, sections_of
-from rfdropo_bayes.verbs.at_rest import Rows, resting, rows_of, spread_rows
+from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, resting, rows_of, spread_rows
 from rfdropo_bayes.verbs.command_lag import best_delay
 from rfdropo_bayes.verbs.motion_check import SOLVED, UNEXPLAINED
 from rfdropo_bayes.verbs.motion_direction import AGREEING
@@ -32,6 +34,19 @@ EXPLAINED = 0.5  # least share of the squared motion that the rod explains in a 
 BENDS = tuple(np.geomspace(1.0 / 8.0, 8.0, 13))
 """Factors of the bend of a command that are tried if no answer sets it, a factor of 1.4 apart. An arm whose cables lie
 at half the assumed distance, and whose spool is a guess, bent 2.1 times as far."""
+
+ENOUGH = 0.99  # share at or above which no exchange of channels is looked for
+LIKELY = 4  # exchanges that are looked at with all compliances
+ACROSS = 0.1  # least share of gravity across the body that shows the azimuth of the cables
+TURNS = tuple(
+    float(turn) for turn in np.arange(12) * 2.0 * np.pi / 12.0
+)  # turns of all cables about the axis of a body that lies [rad]
+SOFTNESS = tuple(np.geomspace(1.0 / 8.0, 8.0, 7))  # compliances that are tried if the stiffness was not given
+NOTHING = 1e3  # unexplained share of a turn at which the rod finds no equilibria
+MINIMA = 3  # turns from which the best is sought
+TURNED, SOFTER, EVALUATIONS = np.radians(15.0), 0.3, 30
+"""First steps of the turn [rad] and of the logarithm of the compliance, and the most steps."""
+FINELY = np.radians(0.5)  # accuracy of the best turn [rad]
 
 
 class Frame(NamedTuple):
@@ -60,7 +75,10 @@ class Registration(NamedTuple):
     frame: Frame | None
     arrangement: Arrangement | None = None  # order of the commands, if it explains much more than the written order
     evidence: str = ""  # reason for the arrangement, in words
-    bend: float = 1.0  # bend of the body that explains the recording, over the bend of the robot as written
+    # bend, softness: bend of the body by a command that explains the recording, and its compliance under its weight,
+    # over the robot as written
+    bend: float = 1.0
+    softness: float = 1.0
 
 
 def frame_of(
@@ -83,12 +101,18 @@ def frame_of(
     return Frame(rotation, shift, scale, float(1.0 - np.sum((moved + shift - seen) ** 2) / motion))
 
 
+def lies(robot: Robot) -> bool:
+    """Whether a robot's weight bends it, which the azimuths of its cables decide on."""
+    return bool(np.linalg.norm(robot.gravity[:2]) > ACROSS * np.linalg.norm(robot.gravity))
+
+
 class _Sight(NamedTuple):
     """An arrangement of a robot in the frame, and with the bend, that bring it nearest to a recording."""
 
     arrangement: Arrangement
     frame: Frame
     bend: float
+    softness: float
 
     @property
     def unexplained(self) -> float:
@@ -96,7 +120,90 @@ class _Sight(NamedTuple):
         return 1.0 - self.frame.explained
 
 
-def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: bool) -> Registration:
+class _Sights:
+    """Sights of a robot in a recording.
+
+    Args:
+        robot: robot at rest, with the markers of the recording.
+        rows: rows of the recording.
+        scaled: whether lengths may be scaled.
+        bends: bends of a command to try.
+        soft: compliances to try of a body that lies, whose weight shows its stiffness, over the robot file's.
+    """
+
+    def __init__(
+        self, robot: RestingRobot, rows: Rows, *, scaled: bool, bends: Sequence[float], soft: Sequence[float]
+    ) -> None:
+        own = robot.simulator.robot
+        self.robot, self.scaled, self.bends = robot, scaled, bends
+        self.rows = rows.of(spread_rows(rows, ROWS))
+        self.fewer = self.rows.of(spread_rows(self.rows, SEARCHED))
+        self.held_by_force, self.modulus = own.held_by_force, own.nominal()["young_modulus"]
+        self.lies = lies(own)
+        self.soft = soft if self.lies and not self.held_by_force else (1.0,)
+
+    def of(
+        self, arrangement: Arrangement, rows: Rows, bends: Sequence[float], soft: Sequence[float] = (1.0,)
+    ) -> _Sight | None:
+        """The best frame, bend and softness of an arrangement; None if the rod finds no equilibria."""
+        sent, turned = arrangement.commands(rows.command), arranged(self.robot, arrangement)
+        tried = [(bend, each) for each in soft for bend in bends]
+        if self.held_by_force:  # a softer body bends farther
+            paths = turned.markers(sent, {"young_modulus": self.modulus / np.array(bends)})
+        else:
+            every = np.concatenate([bend * sent for bend in bends])
+            paths = turned.markers(every, {"young_modulus": self.modulus / np.array(soft)})
+            paths = paths.reshape(len(tried), len(sent), len(turned.shown), 3)
+        solved = [k for k, path in enumerate(paths) if np.isfinite(path).all(axis=(1, 2)).mean() >= SOLVED]
+        frames = {k: frame_of(paths[k], rows.position, scaled=self.scaled) for k in solved}
+        if not frames:
+            return None
+        least = 1.0 - max(frame.explained for frame in frames.values())
+        alike = [k for k, frame in frames.items() if 1.0 - frame.explained <= ALIKE * least]
+        best = min(alike, key=lambda k: float(np.abs(np.log(tried[k])).sum()))  # small bends are all of one form
+        return _Sight(arrangement, frames[best], *tried[best])
+
+    def whole(self, arrangement: Arrangement) -> _Sight | None:
+        """An arrangement in all rows, as written."""
+        return self.of(arrangement, self.rows, self.bends)
+
+    def far(self, arrangement: Arrangement, like: _Sight, soft: Sequence[float]) -> list[_Sight]:
+        """Good sights in fewer rows, best first; of a body that lies, turns about the axis that are better than their
+        neighbours, with the bend of another sight."""
+        if not self.lies:
+            sights = [self.of(arrangement, self.fewer, self.bends)]
+            return [each for each in sights if each is not None]
+        sights = [self.of(arrangement.turned(turn), self.fewer, (like.bend,), soft) for turn in TURNS]
+        left = np.array([np.inf if each is None else each.unexplained for each in sights])
+        lowest = np.flatnonzero((left <= np.roll(left, 1)) & (left <= np.roll(left, -1)) & np.isfinite(left))
+        return [each for k in lowest[np.argsort(left[lowest])] if (each := sights[k]) is not None]
+
+    def near(self, sight: _Sight) -> _Sight | None:
+        """The best sight in all rows; of a body that lies, of turns and compliances near those of a sight."""
+        sights: list[_Sight | None] = []
+
+        def unexplained(steps: Float[np.ndarray, " step"]) -> float:
+            turn, factor = float(steps[0]), float(np.exp(np.sum(steps[1:])))
+            bend, soft = (factor, 1.0) if self.held_by_force else (1.0, factor)
+            arrangement = sight.arrangement.turned(turn)
+            made = self.of(arrangement, self.rows, (bend * sight.bend,), (soft * sight.softness,))
+            sights.append(made)
+            return NOTHING if made is None else made.unexplained
+
+        sights.append(self.of(sight.arrangement, self.rows, self.bends, (sight.softness,)))
+        if self.lies:
+            free = len(self.bends) > 1 if self.held_by_force else len(self.soft) > 1
+            first = np.diag([TURNED, SOFTER])[: 1 + free, : 1 + free]
+            simplex = {"initial_simplex": np.vstack([-0.5 * first.sum(axis=0), first]), "maxfev": EVALUATIONS}
+            minimize(unexplained, np.zeros(1 + free), method="Nelder-Mead", options=simplex | {"xatol": FINELY})
+        return _best(sights)
+
+
+def _best(sights: Iterable[_Sight | None]) -> _Sight | None:
+    return min((each for each in sights if each is not None), key=lambda each: each.unexplained, default=None)
+
+
+def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: bool, stiff: bool = False) -> Registration:
     """Bring the robot of a model, at rest and at nominal values, to a recording.
 
     Args:
@@ -104,6 +211,7 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
         recording: recording, read with the present settings.
         scaled: whether the body's length is not known, so that lengths may be scaled.
         bends: whether the bending per command is unknown.
+        stiff: whether the stiffness is unknown.
     """
     nothing = Registration(None)
     try:
@@ -115,35 +223,14 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
         return nothing
     robot = robot.showing(recording.marker_names)
     rows = rows_of([recording], recording.marker_names, best_delay([recording]))
-    rows = rows.of(spread_rows(rows, ROWS))
-    fewer = rows.of(spread_rows(rows, SEARCHED))
-    tensions = own.actuators[0].unit != "m"
-
-    def sight(arrangement: Arrangement, of: Rows) -> _Sight | None:
-        """The best frame and bend of an arrangement; None if the rod finds no equilibria."""
-        sent, turned = arrangement.commands(of.command), arranged(robot, arrangement)
-        factors = BENDS if bends else (1.0,)
-        if tensions:
-            modulus = own.nominal()["young_modulus"] / np.array(factors)
-            paths = turned.markers(sent, {"young_modulus": modulus} if bends else None)
-        else:
-            every = np.concatenate([factor * sent for factor in factors])
-            paths = turned.markers(every)[0].reshape(len(factors), len(sent), len(turned.shown), 3)
-        solved = [k for k, path in enumerate(paths) if np.isfinite(path).all(axis=(1, 2)).mean() >= SOLVED]
-        frames = {k: frame_of(paths[k], of.position, scaled=scaled) for k in solved}
-        if not frames:
-            return None
-        least = 1.0 - max(frame.explained for frame in frames.values())
-        alike = [k for k, frame in frames.items() if 1.0 - frame.explained <= ALIKE * least]
-        best = min(alike, key=lambda k: abs(np.log(factors[k])))  # small bends are all of one form
-        return _Sight(arrangement, frames[best], float(factors[best]))
-
+    factors = BENDS if bends else (1.0,)
+    sights = _Sights(robot, rows, scaled=scaled, bends=factors, soft=SOFTNESS if stiff else (1.0,))
     start = as_written(len(own.channel_names), sections_of(own).number)
-    written = sight(start, rows)
+    written = sights.whole(start)
     if written is None:
         return nothing
     chosen, evidence = written, ""
-    finding = find_arrangement(robot, rows)
+    finding = find_arrangement(robot, sights.rows)
     positive = all(sign > 0 for sign in finding.arrangement.signs)
     if (
         finding.agreement >= AGREEING
@@ -152,25 +239,41 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
         and not finding.alternatives
         and not finding.mirrored
     ):
-        better = sight(finding.arrangement, rows)
+        better = sights.whole(finding.arrangement)
         if better is not None and better.unexplained <= UNEXPLAINED * written.unexplained:
             chosen = better
             evidence = (
                 f"the motion agrees to {finding.agreement:.2f} with a rod at rest, and to "
                 f"{finding.written.straight:.2f} without"
             )
-    tried = [each for one in _exchanged(chosen.arrangement, own) if (each := sight(one, fewer)) is not None]
-    best = min(tried, key=lambda each: each.unexplained, default=None)
-    better = None if best is None else sight(best.arrangement, rows)
-    if better is not None and better.unexplained <= UNEXPLAINED * chosen.unexplained:
-        evidence = (
-            f"a rod at rest explains {100 * better.frame.explained:.3g} % of the motion, and "
-            f"{100 * chosen.frame.explained:.3g} % without"
-        )
-        chosen = better
-    frame = chosen.frame if chosen.frame.explained >= EXPLAINED else None
+    if sights.lies:
+        better = _best(map(sights.near, sights.far(chosen.arrangement, chosen, sights.soft)[:MINIMA]))
+        if better is not None and ALIKE * better.unexplained < chosen.unexplained:
+            evidence = _explains(better, chosen)
+            chosen = better
+    if chosen.frame.explained < ENOUGH:
+        exchanged = [
+            each
+            for one in _exchanged(chosen.arrangement, own)
+            for each in sights.far(one, chosen, sights.soft[::3])[:1]
+        ]
+        likely = sorted(exchanged, key=lambda each: each.unexplained)[: LIKELY if len(sights.soft) > 1 else 1]
+        closer = [each for one in likely for each in sights.far(one.arrangement, chosen, sights.soft)]
+        better = _best(map(sights.near, sorted(closer, key=lambda each: each.unexplained)[:MINIMA]))
+        if better is not None and better.unexplained <= UNEXPLAINED * chosen.unexplained:
+            evidence = _explains(better, chosen)
+            chosen = better
     arrangement = None if chosen.arrangement == start else chosen.arrangement
-    return Registration(frame, arrangement, evidence, 1.0 if frame is None else chosen.bend)
+    if chosen.frame.explained < EXPLAINED:
+        return Registration(None, arrangement, evidence)
+    return Registration(chosen.frame, arrangement, evidence, chosen.bend, chosen.softness)
+
+
+def _explains(better: _Sight, before: _Sight) -> str:
+    return (
+        f"a rod at rest explains {100 * better.frame.explained:.3g} % of the motion, and "
+        f"{100 * max(before.frame.explained, 0.0):.3g} % without"
+    )
 
 
 def _exchanged(arrangement: Arrangement, robot: Robot) -> Iterator[Arrangement]:

@@ -252,7 +252,7 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     tables = {
         "robot": "asl_trunk",
         "simulator": {"engine": "numba", "drives": "direct", "time_step": 0.02},
-        "model": {"motor_angle": True, "mechanisms": ["actuator_lag"]},
+        "model": {"motor_angle": True, "mechanisms": ["actuator_lag", "command_gain_drift"]},
     }
     spec = spec_of(Experiment.model_validate(tables), Path())
     simulator = build_simulator(spec)
@@ -275,9 +275,10 @@ def test_an_experiment_asks_for_the_angles_and_leaves_the_drives_to_mechanisms()
     model = build_model(spec, simulator, [trunk])
     assert model.measured["motor_angle"].shape == (1, 20, 6)
     noise = {spec.name for spec in noise_specs("auto")}
-    assert set(model.scopes.names) == {"actuator_lag", "motor_angle_noise"} | noise
+    assert set(model.scopes.names) == {"actuator_lag", "command_gain_error_rate", "motor_angle_noise"} | noise
+    assert model.scopes["command_gain_error_rate"].table["scale"] == pytest.approx(0.2 / time[-1])  # a drift in one run
     calibration = CalibrationProblem(model)
-    assert calibration.physical_names == ("actuator_lag",)
+    assert calibration.physical_names == ("actuator_lag", "command_gain_error_rate")
     assert calibration.prior_ends.keys() == calibration.bounds.keys()
     assert calibration.prior_ends["actuator_lag"][0] == 0.0
     measured = {spec.name for spec in measurement_specs(spec.noise, spec.channels)}  # what a posterior may hold beside

@@ -32,8 +32,9 @@ from rfdropo_bayes.discrepancy.fit import optimise
 from rfdropo_bayes.discrepancy.gain import Difference, Gain
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.measurements import gather_measurements
-from rfdropo_bayes.discrepancy.naming import Named, optimised_again, without_each_other, without_needless
+from rfdropo_bayes.discrepancy.naming import Named, without_each_other
 from rfdropo_bayes.discrepancy.pipeline import audit
+from rfdropo_bayes.discrepancy.repairs import optimised_again, simplified
 from rfdropo_bayes.discrepancy.score_tests import p_in_words
 from rfdropo_bayes.discrepancy.sentence import _adoption, _named
 from rfdropo_bayes.discrepancy.verdict import decide
@@ -667,7 +668,7 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
         both = optimise(target, one.x, np.array([*one.free, *order[second].indices]))
         fits = {first: one, second: both}
         steps = [Added(name, (name,), tests, fit, 1.0, {}, target) for name, fit in fits.items()]
-        kept = without_needless(search, base, steps)
+        kept = simplified(search, base, steps)
         assert [step.name for step in kept] == left
         assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}
         assert kept[-1].fit.log_evidence >= both.log_evidence

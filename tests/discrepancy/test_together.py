@@ -8,14 +8,14 @@ from functools import partial
 import numpy as np
 import pytest
 
-from rfdropo_bayes.discrepancy import naming
+from rfdropo_bayes.discrepancy import naming, repairs
 from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import optimise
-from rfdropo_bayes.discrepancy.naming import optimised_again
 from rfdropo_bayes.discrepancy.pipeline import audit
+from rfdropo_bayes.discrepancy.repairs import optimised_again, simplified
 
-from .toys import Geared, Opposed, problem_of
+from .toys import Geared, Opposed, Turned, problem_of
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
@@ -64,7 +64,7 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     gained = extended.log_evidence - stopped.log_evidence
     assert gained > 100.0
     step = Added("cable_gains", ("cable_gains",), replace(tests, fit=stopped), extended, gained, {}, target)
-    monkeypatch.setattr(naming, "optimise", stuck)
+    monkeypatch.setattr(repairs, "optimise", stuck)
     search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
     again = optimised_again(search, step)
     assert again is not None
@@ -72,3 +72,27 @@ def test_equal_gains_of_all_cables_are_not_credited_where_the_radius_of_the_drum
     assert again.log_evidence > extended.log_evidence
     # Where the base model is at its optimum, none is better.
     assert optimised_again(search, replace(step, before=replace(tests, fit=right))) is None
+
+
+@pytest.mark.slow
+def test_a_common_gain_takes_the_place_of_single_gains_after_the_effect_that_they_imitated():
+    """Gains of both cables were named while play was not in the model; a common gain and play are the truth."""
+    asked = problem_of(Turned(), {"radius": 1.0, "play": 3.0, **TRUTH}, 4)
+    target, base = base_model(asked, 0)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
+    tests = search.score_tests(base)
+    gains, radius, play = (search.candidate(name) for name in ("cable_gains", "radius", "play"))
+    one = optimise(target, base.x, np.array([*base.free, *gains.indices]))
+    both = optimise(target, one.x, np.array([*one.free, *play.indices]))
+    refits = {"cable_gains": 9.0, "radius": 8.0, "delay": 1.0}
+    steps = [
+        Added("cable_gains", ("cable_gains",), tests, one, 9.0, refits, target),
+        Added("play", ("play",), tests, both, 9.0, {}, target),
+    ]
+    kept = simplified(search, base, steps)
+    assert [step.name for step in kept] == ["play", "radius"]
+    assert kept[1].members == ("radius",)  # single gains contain it, at the price of one more parameter
+    assert set(kept[1].fit.free) == {*base.free, *play.indices, *radius.indices}
+    assert kept[1].fit.log_evidence > both.log_evidence
+    # A candidate that was not refitted in that step is no alternative.
+    assert simplified(search, base, [replace(steps[0], refits={"cable_gains": 9.0}), steps[1]])[0].name == "cable_gains"

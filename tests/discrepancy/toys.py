@@ -143,7 +143,16 @@ class Geared(Toy):
         return seen._replace(position=seen.position + turned + (radius + second) * level[:, 1, None, None] * FURTHER[1])
 
 
-EVERY_CANDIDATE = {**CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Geared.added}
+class Turned(Geared):
+    """The toy with cables whose common gain may be named."""
+
+    added = types.MappingProxyType(
+        {**Geared.added, "radius": (spec("radius"),), "play": CANDIDATES["play"], "delay": CANDIDATES["delay"]}
+    )
+    parameters = (*Toy.parameters, spec("radius"), *Geared.added["cable_gains"])
+
+
+EVERY_CANDIDATE = {**CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Turned.added}
 
 
 @cache
@@ -262,7 +271,7 @@ def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weig
 TRUTH_OF_CABLES = {"gain": 1.3, "bend": -0.4}
 
 
-def problem_of(toy: Opposed | Geared, truth: dict, seed: int, base: int = len(BASE)) -> AuditProblem:
+def problem_of(toy: Opposed | Geared | Turned, truth: dict, seed: int, base: int = len(BASE)) -> AuditProblem:
     """A data set of a toy with further candidates, which are all that may be named."""
     asked, trajectories = problem({}, seed), recordings(truth, seed, toy)
     gathered = gather_recordings(toy, trajectories)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.mechanisms import mechanisms_named
+from rfdropo_bayes.mechanisms.drift import rates_over
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.mechanisms.sizes import POWERS, USUAL, Scales, scales_of, sized
 from rfdropo_bayes.robots import Robot
@@ -64,3 +65,21 @@ def test_a_mechanism_in_time_needs_rows_with_times():
     whys = [obstacle(mechanism, "rod", "numba", "quasi-static", timed=False) for mechanism in chosen]
     assert [why is None for why in whys] == [False, False, False, True, True]
     assert all(obstacle(m, "rod", "numba", "quasi-static") is None for m in chosen)
+
+
+def test_a_size_drifts_by_its_own_prior_over_a_recording():
+    """A minute or an hour: the change from start to end has the scale of the mechanism that drifts."""
+    drift, size = mechanisms_named(["camera_offset_drift", "camera_offset"], Robot.load("smooth_arm"))
+    other = ParameterSpec("rate", "1/s", 0.0, 1.0, 0.0, {"distribution": "HalfNormal", "scale": 0.1}, "of a law")
+    for seconds in (60.0, 3600.0):
+        *rates, same = rates_over(seconds, (*drift.parameters, other), (drift, size))
+        assert same == other
+        assert [seconds * each.prior["scale"] for each in rates] == pytest.approx(
+            [each.prior["scale"] for each in size.parameters]
+        )
+
+
+def test_wider_disks_on_a_backbone_hardly_change_the_force_that_bends_a_robot():
+    given = {"name": "arm", "length": 0.18, "cable_radius": 0.0045, "markers": {"tip": 0.18}, "young_modulus": 5e10}
+    disks = [Robot.outline(**given, shape="disks", radius=r, inner_radius=0.0006) for r in (0.006, 0.012)]
+    assert scales_of(disks[1]).force == pytest.approx(scales_of(disks[0]).force, rel=1e-3)

@@ -100,6 +100,7 @@ def test_measured_forces_and_angles_stand_for_commands_that_nobody_recorded(tmp_
     guess = guess_columns(tmp_path / "run.csv")
     assert (guess.commands, guess.command_unit) == ([names.format(k) for k in range(1, 5)], unit)
     assert (guess.tensions, guess.motor_angles) == ([], [])
+    assert guess.reads_drives == names.startswith("enc")  # a force without a further word may be commanded
 
 
 def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(tmp_path):

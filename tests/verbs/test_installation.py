@@ -82,6 +82,22 @@ def test_cables_of_an_arm_with_sections_stretch_and_are_turned():
     assert not {"cable_compliance", "guide_azimuth"} & {*installed_mechanisms(forces), *installed_mechanisms(arm())}
 
 
+def test_cables_of_a_metal_backbone_stretch_before_it_shortens():
+    disks = {"shape": "disks", "radius": 0.006, "inner_radius": 0.0006, "cable_radius": 0.0045, "young_modulus": 5e10}
+    backbone = Robot.outline(name="arm", length=0.18, markers={"tip": 0.18}, command_unit="m", **disks)
+    assert "cable_compliance" in installed_mechanisms(backbone)
+    assert any(line.startswith("cable_compliance = {}") for line in installed_priors(backbone, None))
+    assert "cable_compliance" not in installed_mechanisms(arm(unit="m"))
+
+
+def test_gravity_turns_about_an_arm_that_lies_with_unknown_azimuths():
+    lying = Robot.outline(name="arm", length=0.2, radius=0.02, markers={"tip": 0.2}, gravity="-y")
+    known = ["segment_azimuths"]
+    assert "base_tilt" in priors_of(installed_priors(lying, None, None, known))
+    found = [installed_mechanisms(robot, given) for robot, given in ((lying, known), (lying, ()), (arm(), known))]
+    assert ["base_tilt" in each for each in found] == [True, False, False]
+
+
 def test_a_budget_in_minutes_follows_the_time_of_a_rollout():
     slow, fast = budget_within(3.0, 1.0, 1.5), budget_within(3.0, 0.01, 1.5)
     assert slow.rollouts == pytest.approx(90)

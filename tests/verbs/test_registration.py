@@ -48,6 +48,27 @@ def test_markers_that_rest_are_no_motion_that_a_rod_explains():
     assert frame_of(made, seen, scaled=False).explained < 0.3
 
 
+TURN, SHIFT = Rotation.from_euler("xyz", (2.0, 0.4, -1.0)).as_matrix(), np.array([0.3, -0.1, 0.2])
+
+
+def poses(position, markers, command, unit):
+    """A recording of a robot at rest, turned and shifted."""
+    time = np.arange(float(len(command)))
+    return Trajectory.from_arrays(
+        time=time,
+        time_unit="s",
+        position=position @ TURN.T + SHIFT,
+        position_unit="m",
+        markers=markers,
+        channels=("c1", "c2", "c3"),
+        command=command,
+        command_unit=unit,
+        command_time=time - 0.5,
+        initial_command="zero",
+        name="poses",
+    )
+
+
 def arm(length: float, radius: float, spool: float) -> Robot:
     """An arm without gravity whose sizes were not given."""
     return Robot.outline(
@@ -68,24 +89,29 @@ def test_sizes_order_and_frame_are_found_from_poses(size, spool):
     way round: three pulls and the poses of a rod at rest under them are enough."""
     true = resting(ModelSpec(arm(0.2 * size, 0.012 * size, spool * size)))
     command = np.random.default_rng(0).uniform(0.0, 0.6, size=(60, 3))
-    turn, shift = Rotation.from_euler("xyz", (2.0, 0.4, -1.0)).as_matrix(), np.array([0.3, -0.1, 0.2])
-    made = true.markers(command[:, [0, 2, 1]])[0] @ turn.T + shift
-    recording = Trajectory.from_arrays(
-        time=np.arange(60.0),
-        time_unit="s",
-        position=made,
-        position_unit="m",
-        markers=("tip",),
-        channels=("c1", "c2", "c3"),
-        command=command,
-        command_unit="rad",
-        command_time=np.arange(60.0) - 0.5,
-        initial_command="zero",
-        name="poses",
-    )
+    made = true.markers(command[:, [0, 2, 1]])[0]
+    recording = poses(made, ("tip",), command, "rad")
     found = register(ModelSpec(arm(0.2, 0.012, 0.01)), recording, scaled=True, bends=True)
     assert found.arrangement is not None
     assert found.arrangement.columns in ((0, 2, 1), (2, 1, 0), (1, 0, 2))
     assert found.frame.explained > 0.995
     assert found.frame.scale == pytest.approx(size, rel=0.15)
     assert found.bend == pytest.approx(spool / 0.01, rel=0.25)  # the nearest of factors that lie 1.4 apart
+
+
+def test_the_weight_of_an_arm_that_lies_shows_the_azimuth_of_its_cables():
+    """A frame that is turned about the axis could explain the bends by cables alone, and not the sag."""
+
+    def lying(azimuth: float) -> Robot:
+        sizes = {"length": 0.2, "radius": 0.014, "cable_radius": 0.01, "young_modulus": 3e5}
+        markers = {"middle": 0.1, "tip": 0.2}
+        return Robot.outline(name="arm", cables=3, markers=markers, **sizes, gravity="-y", segment_azimuths=(azimuth,))
+
+    command = np.random.default_rng(0).uniform(0.0, 0.008, size=(16, 3))
+    made = resting(ModelSpec(lying(217.0))).markers(command)[0]
+    found = register(ModelSpec(lying(0.0)), poses(made, ("middle", "tip"), command, "m"), scaled=False, bends=False)
+    assert found.arrangement is not None
+    assert found.arrangement.columns == (0, 1, 2)
+    assert np.degrees(found.arrangement.turns[0]) % 360.0 == pytest.approx(217.0, abs=2.0)
+    assert found.frame.explained > 0.999
+    np.testing.assert_allclose(found.frame.rotation, TURN, atol=0.03)
