@@ -192,6 +192,7 @@ def init(
         matching_recordings,
         of_robot,
         with_counts,
+        with_drives,
         with_given,
         with_turns,
         write_first_files,
@@ -230,7 +231,8 @@ def init(
     answers["young_modulus"] = ask.answer("young_modulus", modulus, "Young's modulus [MPa]", 1.0)
     answers["markers"] = _markers(ask, guess, markers, answers["length"])
     outline = _outline(_name(folder.resolve().name, "robot"), disks, unit, answers, ask.assumed)
-    guess = None if guess is None else of_robot(guess, outline)
+    if guess is not None:
+        guess, outline = with_drives(of_robot(guess, outline), outline)
     robot, experiment = write_first_files(folder, outline, files, sent, guess)
     typer.echo(f"wrote {robot}\nwrote {experiment}")
     if ask.assumed:

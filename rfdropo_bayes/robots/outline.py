@@ -191,7 +191,7 @@ class RobotOutline:
         Args:
             scale: factor of the lengths that were assumed.
             bend: factor of the bend of a command, by the attribute that `sets_bend`.
-            softness: factor of the bend under the weight, of drives that impose lengths.
+            softness: factor of the body's compliance.
             evidence: reason for length and radius, in words.
         """
         lengths = ("length", "radius", "tip_radius", "inner_radius")
@@ -204,7 +204,7 @@ class RobotOutline:
             changes["markers"] = {name: _rounded(scale * height) for name, height in self.markers.items()}
         if {"radius", "cable_radius"} <= self.assumed:
             changes["cable_radius"] = None  # it follows the body
-        if softness != 1.0:
+        if softness != 1.0 and self.sets_bend != "young_modulus":
             changes["young_modulus"] = _rounded(self.young_modulus * scale / softness)
         sized = replace(self, **changes, size_evidence=evidence)
         if self.sets_bend == "spool_radius":
@@ -220,7 +220,7 @@ class RobotOutline:
             before, after = (
                 o.bending_force / o.force_of_unit / o.young_modulus * o.arm / o.length for o in (self, sized)
             )
-            return replace(sized, young_modulus=_rounded(self.young_modulus / bend * before / after))
+            return replace(sized, young_modulus=_rounded(self.young_modulus / softness * before / after))
         return sized
 
     @property

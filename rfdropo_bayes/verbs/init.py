@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -31,12 +32,15 @@ from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_pri
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
-from rfdropo_bayes.verbs.unit_by_motion import unit_of_motion
+from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
 READ = "the commands are readings of the drives, taken with the pose of their row"
+NAMED = re.compile(r"motor|servo|joint|theta|angle|enc|pull|cable|tendon|length|travel|displ|pos|wire", re.IGNORECASE)
+"""Names of commands that are lengths of cable or angles of motors."""
 CAPTURED = (motive_csv.FORMAT, rosbag.FORMAT)  # formats that come from motion capture, which loses markers now and then
+FORCES = (0.2, 2.5)  # least and largest force of a command over an assumed force
 FAR_ORIGIN = 0.1  # share of the body's length: a frame whose origin lies farther from the base is moved there
 AXES = {"+z": ["x", "z", "-y"], "-z": ["x", "-z", "y"]}
 """The base's axes in terms of Motive's, whose y axis points up: of a robot that hangs, and of one that stands."""
@@ -150,6 +154,24 @@ def _moved(guess: Guess, outline: RobotOutline) -> Guess:
     return guess._replace(command_unit=unit.unit, evidence={**guess.evidence, "command_unit": unit.evidence})
 
 
+def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutline]:
+    """A guess and a robot whose commands are inputs of drives of unknown force, such as pressures, if no name says that
+    they are lengths, and lengths would bend the robot much farther than its markers moved, even in millimetres."""
+    evidence = guess.evidence.get("command_unit", "")
+    named = guess.units or any(NAMED.search(name) for name in guess.commands)
+    if not evidence or named or outline.pairs or outline.command_unit != "m" or "markers" in outline.assumed:
+        return guess, outline
+    robot = parse_table(Robot, outlined_tables(outline), where="outline")
+    if len(guess.commands) != len(robot.channel_names) or len(guess.positions) != len(outline.markers):
+        return guess, outline
+    seen = METRES[guess.position_unit] * guess.seen
+    words = bends_too_far(robot, METRES["mm"] * guess.sent, seen, list(outline.markers.values()))
+    if words is None:
+        return guess, outline
+    said = {**guess.evidence, "command_unit": f"{evidence}; {words}: drives of unknown force, such as pressures"}
+    return guess._replace(command_unit="-", evidence=said), replace(outline, command_unit="-")
+
+
 def write_first_files(
     folder: Path, outline: RobotOutline, recordings: list[Path], commands: list[Path], guess: Guess | None
 ) -> tuple[Path, Path]:
@@ -176,9 +198,13 @@ def write_first_files(
     made = Robot.load(robot)
 
     def write(
-        data: list[str], slow: str | None = None, first: Trajectory | None = None, seen: Frame | None = None
+        data: list[str],
+        slow: str | None = None,
+        first: Trajectory | None = None,
+        seen: Frame | None = None,
+        gain: float = 1.0,
     ) -> Experiment:
-        model = _model(made, outline, guess, first, seen, rests=slow is not None)
+        model = _model(made, outline, guess, first, seen, gain, rests=slow is not None)
         lines = [*_head(outline.name), *data, *_simulator(slow), *model, *group_lines(days)]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
@@ -255,7 +281,8 @@ def write_first_files(
             lines = moved_frame(columns, turned, -turned @ registration.frame.shift)
             frame = [f"{line}  # ASSUMED: {explained} in this frame" for line in lines]
             registration = registration._replace(frame=registration.frame._replace(shift=np.zeros(3)))
-    write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame)
+    gain = float(np.clip(registration.bend / registration.softness, *FORCES))
+    write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame, gain)
     return robot, experiment
 
 
@@ -479,6 +506,7 @@ def _model(
     guess: Guess | None,
     first: Trajectory | None,
     seen: Frame | None,
+    gain: float,
     *,
     rests: bool,
 ) -> list[str]:
@@ -503,7 +531,7 @@ def _model(
         "",
         "[model.priors]          # inferred parameters; {} asks for the prior of the robot file or of the mechanism",
         *wanted,
-        *installed_priors(robot, first, seen, outline.assumed),
+        *installed_priors(robot, first, seen, outline.assumed, gain),
         "",
         "[inference]",
         'method = "laplace"      # rfdropo methods lists them',

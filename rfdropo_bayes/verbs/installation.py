@@ -14,7 +14,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.mechanisms.sizes import scales_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import sections_of
-from rfdropo_bayes.verbs.registration import Frame, lies
+from rfdropo_bayes.verbs.registration import UNSTATED, Frame, lies
 
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
@@ -27,7 +27,6 @@ GAIN = 0.1  # standard deviation of the relative error of a command in metres of
 UNKNOWN = 0.5
 """The same of a robot whose cables' distance from the axis, or whose length, was not given; and of pressures and inputs
 of drives, whose force per command no answer states."""
-UNSTATED = ("Pa", "-")  # units of commands whose force per command is not stated
 
 
 def largest_pull(robot: Robot, recording: Trajectory) -> float:
@@ -63,7 +62,11 @@ def _hardly_shortens(robot: Robot) -> bool:
 
 
 def installed_priors(
-    robot: Robot, recording: Trajectory | None, frame: Frame | None = None, assumed: Collection[str] = ()
+    robot: Robot,
+    recording: Trajectory | None,
+    frame: Frame | None = None,
+    assumed: Collection[str] = (),
+    gain: float = 1.0,
 ) -> list[str]:
     """Lines of [model.priors] of a robot as it is installed.
 
@@ -72,6 +75,7 @@ def installed_priors(
         recording: recording whose commands set the sizes of the cables' zeros.
         frame: frame in which a rod at rest explains that recording; priors are centred there.
         assumed: unknown sizes of the robot, which get wide priors.
+        gain: force of drives that explains that recording, over the robot file's, if no answer states it.
     """
     lines = []
 
@@ -95,7 +99,7 @@ def installed_priors(
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
     if robot.command_unit in UNSTATED:
-        normal("command_gain_error", UNKNOWN, "force of a drive over that of the robot file, less 1")
+        normal("command_gain_error", UNKNOWN * gain, "force of a drive over that of the robot file, less 1", gain - 1.0)
     if "length" in assumed:
         normal("camera_scale_error", UNKNOWN, "lengths over the robot file's lengths, less 1")
     if _pulled_by_section(robot) or _hardly_shortens(robot):

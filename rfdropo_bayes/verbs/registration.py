@@ -42,11 +42,14 @@ TURNS = tuple(
     float(turn) for turn in np.arange(12) * 2.0 * np.pi / 12.0
 )  # turns of all cables about the axis of a body that lies [rad]
 SOFTNESS = tuple(np.geomspace(1.0 / 8.0, 8.0, 7))  # compliances that are tried if the stiffness was not given
-NOTHING = 1e3  # unexplained share of a turn at which the rod finds no equilibria
+MOST = np.log(16.0)  # largest logarithm of a factor
+NOTHING = 1e3  # unexplained share without equilibria
 MINIMA = 3  # turns from which the best is sought
-TURNED, SOFTER, EVALUATIONS = np.radians(15.0), 0.3, 30
-"""First steps of the turn [rad] and of the logarithm of the compliance, and the most steps."""
-FINELY = np.radians(0.5)  # accuracy of the best turn [rad]
+TURNED, SOFTER, EVALUATIONS = np.radians(15.0), 0.3, 10
+"""First steps of the turn [rad] and of the logarithms of the factors, and the most evaluations for each corner of a
+simplex."""
+UNSTATED = ("Pa", "-")  # units of commands whose force per command is not stated
+FINELY = 0.03  # accuracy of the best turn and factors, in first steps
 
 
 class Frame(NamedTuple):
@@ -75,8 +78,8 @@ class Registration(NamedTuple):
     frame: Frame | None
     arrangement: Arrangement | None = None  # order of the commands, if it explains much more than the written order
     evidence: str = ""  # reason for the arrangement, in words
-    # bend, softness: bend of the body by a command that explains the recording, and its compliance under its weight,
-    # over the robot as written
+    # bend, softness: bend of the body by a command that explains the recording, and its compliance, over the robot as
+    # written
     bend: float = 1.0
     softness: float = 1.0
 
@@ -120,6 +123,9 @@ class _Sight(NamedTuple):
         return 1.0 - self.frame.explained
 
 
+Factors = tuple[float, float]  # bend and softness, see `Registration`
+
+
 class _Sights:
     """Sights of a robot in a recording.
 
@@ -128,74 +134,77 @@ class _Sights:
         rows: rows of the recording.
         scaled: whether lengths may be scaled.
         bends: bends of a command to try.
-        soft: compliances to try of a body that lies, whose weight shows its stiffness, over the robot file's.
+        stiff: whether the stiffness of a body that lies is unknown, so that its compliance is tried as well.
     """
 
-    def __init__(
-        self, robot: RestingRobot, rows: Rows, *, scaled: bool, bends: Sequence[float], soft: Sequence[float]
-    ) -> None:
+    def __init__(self, robot: RestingRobot, rows: Rows, *, scaled: bool, bends: Sequence[float], stiff: bool) -> None:
         own = robot.simulator.robot
-        self.robot, self.scaled, self.bends = robot, scaled, bends
+        self.robot, self.scaled, self.lies = robot, scaled, lies(own)
         self.rows = rows.of(spread_rows(rows, ROWS))
         self.fewer = self.rows.of(spread_rows(self.rows, SEARCHED))
         self.held_by_force, self.modulus = own.held_by_force, own.nominal()["young_modulus"]
-        self.lies = lies(own)
-        self.soft = soft if self.lies and not self.held_by_force else (1.0,)
+        # Of forces, the compliance alone sets both, unless the force of a command is not stated.
+        tied, free = own.held_by_force and own.command_unit not in UNSTATED, self.lies and stiff
+        self.written = [(bend, bend if own.held_by_force else 1.0) for bend in bends]
+        self.soft = [1.0] if not free or tied else list(SOFTNESS)
+        self.steps = [[SOFTER, SOFTER]] if tied else [[0.0, SOFTER], *([[SOFTER, 0.0]] * own.held_by_force)]
+        self.steps = self.steps if free else []
 
-    def of(
-        self, arrangement: Arrangement, rows: Rows, bends: Sequence[float], soft: Sequence[float] = (1.0,)
-    ) -> _Sight | None:
-        """The best frame, bend and softness of an arrangement; None if the rod finds no equilibria."""
+    def of(self, arrangement: Arrangement, rows: Rows, tried: Sequence[Factors]) -> _Sight | None:
+        """The best frame and factors of an arrangement; None if the rod finds no equilibria."""
         sent, turned = arrangement.commands(rows.command), arranged(self.robot, arrangement)
-        tried = [(bend, each) for each in soft for bend in bends]
-        if self.held_by_force:  # a softer body bends farther
-            paths = turned.markers(sent, {"young_modulus": self.modulus / np.array(bends)})
-        else:
-            every = np.concatenate([bend * sent for bend in bends])
-            paths = turned.markers(every, {"young_modulus": self.modulus / np.array(soft)})
-            paths = paths.reshape(len(tried), len(sent), len(turned.shown), 3)
-        solved = [k for k, path in enumerate(paths) if np.isfinite(path).all(axis=(1, 2)).mean() >= SOLVED]
-        frames = {k: frame_of(paths[k], rows.position, scaled=self.scaled) for k in solved}
+        frames: dict[Factors, Frame] = {}
+        for bend, softness in tried:
+            size = bend / softness if self.held_by_force else bend  # a softer body bends farther under a force
+            path = turned.markers(size * sent, {"young_modulus": np.array([self.modulus / softness])})[0]
+            if np.isfinite(path).all(axis=(1, 2)).mean() >= SOLVED:
+                frames[bend, softness] = frame_of(path, rows.position, scaled=self.scaled)
         if not frames:
             return None
         least = 1.0 - max(frame.explained for frame in frames.values())
-        alike = [k for k, frame in frames.items() if 1.0 - frame.explained <= ALIKE * least]
-        best = min(alike, key=lambda k: float(np.abs(np.log(tried[k])).sum()))  # small bends are all of one form
-        return _Sight(arrangement, frames[best], *tried[best])
+        alike = [factors for factors, frame in frames.items() if 1.0 - frame.explained <= ALIKE * least]
+        best = min(alike, key=lambda factors: float(np.abs(np.log(factors)).sum()))  # small bends are all of one form
+        return _Sight(arrangement, frames[best], *best)
 
     def whole(self, arrangement: Arrangement) -> _Sight | None:
         """An arrangement in all rows, as written."""
-        return self.of(arrangement, self.rows, self.bends)
+        return self.of(arrangement, self.rows, self.written)
 
     def far(self, arrangement: Arrangement, like: _Sight, soft: Sequence[float]) -> list[_Sight]:
         """Good sights in fewer rows, best first; of a body that lies, turns about the axis that are better than their
         neighbours, with the bend of another sight."""
         if not self.lies:
-            sights = [self.of(arrangement, self.fewer, self.bends)]
+            sights = [self.of(arrangement, self.fewer, self.written)]
             return [each for each in sights if each is not None]
-        sights = [self.of(arrangement.turned(turn), self.fewer, (like.bend,), soft) for turn in TURNS]
+        tried = [(like.bend, like.softness if len(soft) == 1 else each) for each in soft]
+        sights = [self.of(arrangement.turned(turn), self.fewer, tried) for turn in TURNS]
         left = np.array([np.inf if each is None else each.unexplained for each in sights])
         lowest = np.flatnonzero((left <= np.roll(left, 1)) & (left <= np.roll(left, -1)) & np.isfinite(left))
         return [each for k in lowest[np.argsort(left[lowest])] if (each := sights[k]) is not None]
 
-    def near(self, sight: _Sight) -> _Sight | None:
-        """The best sight in all rows; of a body that lies, of turns and compliances near those of a sight."""
+    def near(self, sight: _Sight, *, turning: bool = True) -> _Sight | None:
+        """The best sight in all rows; of a body that lies, of factors, and turns if asked, near those of a sight."""
+        if not self.lies:
+            return self.whole(sight.arrangement)
         sights: list[_Sight | None] = []
 
         def unexplained(steps: Float[np.ndarray, " step"]) -> float:
-            turn, factor = float(steps[0]), float(np.exp(np.sum(steps[1:])))
-            bend, soft = (factor, 1.0) if self.held_by_force else (1.0, factor)
-            arrangement = sight.arrangement.turned(turn)
-            made = self.of(arrangement, self.rows, (bend * sight.bend,), (soft * sight.softness,))
+            turn, *factor = steps @ directions
+            factors = (float(np.exp(factor[0])) * sight.bend, float(np.exp(factor[1])) * sight.softness)
+            if np.abs(np.log(factors)).max() > MOST:
+                return NOTHING
+            made = self.of(sight.arrangement.turned(float(turn)), self.rows, [factors])
             sights.append(made)
             return NOTHING if made is None else made.unexplained
 
-        sights.append(self.of(sight.arrangement, self.rows, self.bends, (sight.softness,)))
-        if self.lies:
-            free = len(self.bends) > 1 if self.held_by_force else len(self.soft) > 1
-            first = np.diag([TURNED, SOFTER])[: 1 + free, : 1 + free]
-            simplex = {"initial_simplex": np.vstack([-0.5 * first.sum(axis=0), first]), "maxfev": EVALUATIONS}
-            minimize(unexplained, np.zeros(1 + free), method="Nelder-Mead", options=simplex | {"xatol": FINELY})
+        directions = np.array([[TURNED, 0.0, 0.0]] * turning + [[0.0, *step] for step in self.steps]).reshape(-1, 3)
+        if count := len(directions):
+            first = np.vstack([np.zeros(count), np.eye(count)])
+            options = {"initial_simplex": first - first.mean(axis=0), "maxfev": EVALUATIONS * (count + 1)}
+            minimize(unexplained, first[0], method="Nelder-Mead", options=options | {"xatol": FINELY})
+        if not self.held_by_force:
+            tried = [(bend, sight.softness) for bend, _ in self.written]
+            sights.append(self.of(sight.arrangement, self.rows, tried))
         return _best(sights)
 
 
@@ -224,7 +233,7 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
     robot = robot.showing(recording.marker_names)
     rows = rows_of([recording], recording.marker_names, best_delay([recording]))
     factors = BENDS if bends else (1.0,)
-    sights = _Sights(robot, rows, scaled=scaled, bends=factors, soft=SOFTNESS if stiff else (1.0,))
+    sights = _Sights(robot, rows, scaled=scaled, bends=factors, stiff=stiff)
     start = as_written(len(own.channel_names), sections_of(own).number)
     written = sights.whole(start)
     if written is None:
@@ -247,10 +256,13 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
                 f"{finding.written.straight:.2f} without"
             )
     if sights.lies:
-        better = _best(map(sights.near, sights.far(chosen.arrangement, chosen, sights.soft)[:MINIMA]))
-        if better is not None and ALIKE * better.unexplained < chosen.unexplained:
-            evidence = _explains(better, chosen)
-            chosen = better
+        straight = sights.near(chosen, turning=False) or chosen
+        turned = _best(map(sights.near, sights.far(chosen.arrangement, chosen, sights.soft)[:MINIMA]))
+        if ALIKE * straight.unexplained < chosen.unexplained:
+            chosen = straight
+        if turned is not None and ALIKE * turned.unexplained < min(straight.unexplained, chosen.unexplained):
+            evidence = _explains(turned, chosen)
+            chosen = turned
     if chosen.frame.explained < ENOUGH:
         exchanged = [
             each

@@ -15,10 +15,11 @@ from jaxtyping import Float
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_units import ANGLES, METRIC, Unit
-from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, Size
+from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, OFF, Size
 
 MOST_TURN = np.pi  # largest turn of a body [rad] by its cables
 MISREAD = 5.0  # ratio of the measured motion and this estimate at or above which another unit replaces a guess
+BARELY = 0.999  # share of `MOST_TURN` that rounding does not carry beyond it
 STEPS = 81  # along the body
 
 
@@ -100,6 +101,26 @@ def unit_of_motion(
     said = [_driven_words(moved.get(name), name) for name in dict.fromkeys((chosen, guessed.unit))]
     words = f"the markers move by {1e3 * measured:.3g} mm, by the cables {', '.join(said)}"
     return Unit(chosen, guessed.others, f"{guessed.evidence}; {words}")
+
+
+def bends_too_far(
+    robot: Robot,
+    command: Float[np.ndarray, "row channel"],
+    position: Float[np.ndarray, "row marker 3"],
+    heights: Sequence[float],
+) -> str | None:
+    """Why commands cannot be these lengths of cable [m], in words: markers move a small part of the way to which cables
+    of these lengths, or of a share of these that bends the body by `MOST_TURN`, would drive it. None if they can be."""
+    if not np.isfinite(command).all():
+        return None
+    place = np.linspace(min(cable.anchor_z_m for cable in robot.cables), max(heights), STEPS)
+    pull = command @ np.asarray(robot.channel_matrix(robot.nominal()), dtype=float).T
+    turn = float(np.linalg.norm(_turns(robot, pull, place), axis=2).max())
+    driven = driven_motion(robot, min(1.0, BARELY * MOST_TURN / max(turn, 1e-12)) * command, heights)
+    size = None if driven is None else Size(spread(position), spread(driven))
+    if size is None or size.measured == 0.0 or size.ratio > 1.0 / OFF:
+        return None
+    return f"the markers move by {1e3 * size.measured:.3g} mm, and by such lengths of cable {1e3 * size.nominal:.3g} mm"
 
 
 def _driven_words(size: Size | None, unit: str) -> str:

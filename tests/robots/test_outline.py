@@ -144,7 +144,7 @@ def test_a_robot_of_another_size_bends_by_the_given_factor(unit, assumed):
     """Bend of a command: pull over the cables' distance, or tension times distance and length over the stiffness."""
     unknown = frozenset({"length", "radius", "markers", assumed})
     small = RobotOutline("arm", 0.2, 0.012, {"tip": 0.2}, command_unit=unit, assumed=unknown)
-    large = small.resized(1.5, 2.0, 1.0, "measured")
+    large = small.resized(1.5, 2.0, 2.0 if unit == "N" else 1.0, "measured")
 
     def bend(o: RobotOutline) -> float:
         if unit == "N":

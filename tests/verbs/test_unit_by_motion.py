@@ -8,7 +8,7 @@ import pytest
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_units import Unit
-from rfdropo_bayes.verbs.unit_by_motion import driven_motion, spread, unit_of_motion
+from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, driven_motion, spread, unit_of_motion
 
 ANSWERS = {"name": "cone", "length": 0.2, "radius": 0.015, "markers": {"middle": 0.1, "tip": 0.2}}
 HEIGHTS = {"middle": 0.1, "tip": 0.2}
@@ -71,3 +71,13 @@ def test_a_motion_that_no_unit_explains_keeps_the_guess():
     assert "in mm" in found.evidence
     lost = np.full((90, 2, 3), np.nan)
     assert unit_of_motion(robot(), opposed(1e-4), lost, HEIGHTS, Unit("mm", evidence="x")).evidence == "x"
+
+
+def test_lengths_that_would_bend_a_body_much_farther_than_it_moved_are_no_lengths():
+    """Pressures of 70 kPa, read as 70 mm of cable, would bend the body by more than half a turn."""
+    arm, heights = robot(), list(HEIGHTS.values())
+    position = np.concatenate([driven_motion(arm, opposed(0.002), heights), np.zeros((len(TIME), 2, 1))], axis=2)
+    words = bends_too_far(arm, opposed(0.07), position, heights)
+    assert f"the markers move by {1e3 * spread(position):.3g} mm" in words
+    assert bends_too_far(arm, opposed(0.004), position, heights) is None
+    assert bends_too_far(arm, opposed(0.07), np.full_like(position, np.nan), heights) is None
