@@ -31,7 +31,7 @@ from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.check_figures import rest_figure
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
-from rfdropo_bayes.robots.plausibility import implausible_values
+from rfdropo_bayes.robots.robot import implausible_values
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
