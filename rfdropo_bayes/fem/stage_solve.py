@@ -7,6 +7,22 @@ A stage finds the change d of velocities and spins, and the impulses g of all co
 All expensive operations run on lanes of a batch (``lanes``). A derivative takes one more right-hand side of the
 factorised system: the change of the equations' residual with the inputs, at a constant solution. Reverse mode uses the
 transposed system.
+
+Functions of arrays whose last axis is a batch: ``jax.vmap`` extends this axis instead of adding a leading axis.
+
+XLA vectorises over the last axis. With a batch in front, matrices of 6 x 6 would be that axis, and short.
+
+Symmetric positive definite systems along a chain of stations with six unknowns each: Cholesky's factor, written out
+by components, with a batch in the last axis (``lanes``).
+
+Matrices come as the stiffness of the elements between stations and the inertia at stations. Blocks are assembled during
+elimination, which saves memory traffic.
+
+The constraint problem of cables alone, on lanes of a batch: a complementarity problem, solved by its active set.
+
+With cables only, Newton's step of ``constraints`` is the solution of R g + W g = -b over the cables that pull. It is
+the answer if these cables are the same after it. Most steps have the same active set as the step before. Otherwise
+Newton's method continues from the impulses of that step, with the line search of `fem.constraints`.
 """
 
 from __future__ import annotations

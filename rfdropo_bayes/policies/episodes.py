@@ -1,6 +1,8 @@
 """Many episodes of a task at once, each lane with its own parameters, goal, commands and age.
 
 Gymnasium and Stable-Baselines3 use different interfaces of an environment; `gym_env` and `vec_env` provide them.
+
+Gymnasium's spaces of a policy layout. Environments from a few names: task, mechanisms, randomisation.
 """
 
 from __future__ import annotations

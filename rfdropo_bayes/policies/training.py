@@ -3,6 +3,8 @@
 At the end of a leg the policy is evaluated on the same cases as before, and everything is saved. The next leg begins
 with all environments reset and all generators seeded by the run's seed and the leg's number, in the same or a new
 process. The learning curve therefore does not depend on interruptions.
+
+Options of the training algorithm, PPO of Stable-Baselines3, checked before anything is simulated.
 """
 
 from __future__ import annotations

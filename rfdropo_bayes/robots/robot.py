@@ -1,4 +1,11 @@
-"""A robot: body, mount, cables, chambers, commands, markers, parameters and, for pushing, an object on a plate."""
+"""A robot: body, mount, cables, chambers, commands, markers, parameters and, for pushing, an object on a plate.
+
+Shape of a robot at rest, as plain numbers for a picture.
+
+Implausible numbers in a robot's description, such as millimetres given as metres.
+
+Bounds lie far beyond existing robots: they catch wrong units (factors of a thousand), not bad guesses.
+"""
 
 from __future__ import annotations
 

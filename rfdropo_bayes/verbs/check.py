@@ -24,9 +24,9 @@ from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
 from rfdropo_bayes.model.experiment import ROLLOUTS, AuditTable, Experiment, InferenceTable, load_experiment
-from rfdropo_bayes.model.mechanism_listings import robot_facts, simulator_facts
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
+from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.check_figures import rest_figure
 from rfdropo_bayes.report.trajectory_figures import save_recording
