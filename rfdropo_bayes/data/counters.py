@@ -20,6 +20,7 @@ SEVERAL = 2  # jumps that it takes to believe in a turn of no known counter
 EXCEPTIONAL = 3.0  # multiple of the 95 % quantile of step sizes above which a step may be a restart
 BETTER, MUCH_BETTER = 0.9, 0.5
 """Ratio of the errors without and with the jumps of a turn, and of a restart, below which markers did not follow."""
+FILLED = 0.8  # least share of a known turn over which values extend that wrap between rows far apart
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.4)  # [s] of the markers after the commands
 ROWS = 4000  # that a regression looks at, at most
 POWERS = tuple(2.0**k for k in range(8, 33))  # turns of counters in whole numbers
@@ -31,6 +32,7 @@ class Wraps(NamedTuple):
     rows: tuple[int, ...]  # after the jumps
     turn: float  # turn of the counter, in the unit of the column
     known: bool  # whether this is the turn of a known counter; else it is estimated from the jumps
+    clear: bool = True  # whether no step is of a length between the jumps and the motion beside them
 
 
 class Column(NamedTuple):
@@ -75,7 +77,7 @@ def turns_of(unit: str, counts_per_turn: float | None, values: np.ndarray) -> li
 
 def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wraps | None:
     """Jumps of about one turn relative to the motion before and after; None without jumps, or if steps of all lengths
-    occur.
+    occur in values that do not fill a known turn.
 
     Args:
         values: values of one column; missing values are skipped.
@@ -96,10 +98,19 @@ def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wr
     continued = np.abs(size[jump] - turn).max() <= 1.5 * usual
     within = extent <= 1.01 * turn
     if not (continued and within) or usual > SHORT * turn or size[jump].min() < LONG * turn:
-        return None
+        return _folded(values, rows, turns)
     if not near and np.count_nonzero(jump) < SEVERAL:
         return None
     return Wraps(tuple(int(row) for row in rows[1:][jump]), turn, bool(near))
+
+
+def _folded(values: np.ndarray, rows: np.ndarray, turns: Sequence[float]) -> Wraps | None:
+    """Jumps by over half a known turn that the values fill, if the steps between these are too long to tell."""
+    extent, jump = float(np.ptp(values[rows])), np.abs(np.diff(values[rows]))
+    filled = [turn for turn in turns if FILLED * turn <= extent <= turn and np.any(jump > 0.5 * turn)]
+    if not filled:
+        return None
+    return Wraps(tuple(int(row) for row in rows[1:][jump > 0.5 * filled[0]]), filled[0], known=True, clear=False)
 
 
 def _towards(step: np.ndarray, k: int, short: np.ndarray) -> float:
@@ -126,7 +137,7 @@ def wraps_of(columns: Sequence[Column], motion: Motion) -> dict[str, Wraps]:
         k = names.index(name)
         again = whole.copy()
         again[:, k] = raw[:, k]
-        if best < BETTER * regression_error(again, motion):
+        if best < (BETTER if each.clear else MUCH_BETTER) * regression_error(again, motion):
             doubtful[name] = each
     return doubtful
 
