@@ -126,20 +126,20 @@ def wraps_of(columns: Sequence[Column], motion: Motion) -> dict[str, Wraps]:
     together = len(wraps) > 1 and len({row for each in wraps.values() for row in each.rows}) == 1
     if not wraps or together:  # counters that jump together, and once, were started anew
         return {}
-    names = [column.name for column in columns]
     raw = np.stack([column.values for column in columns], axis=1)
-    whole = raw.copy()
+    whole, numbers = raw.copy(), {column.name: k for k, column in enumerate(columns)}
     for name, each in wraps.items():
-        whole[:, names.index(name)] = unwrapped(raw[:, names.index(name)], each.turn)
+        whole[:, numbers[name]] = unwrapped(raw[:, numbers[name]], each.turn)
     best = regression_error(whole, motion)
-    doubtful = {}
-    for name, each in wraps.items():
-        k = names.index(name)
+    for name, k in numbers.items():  # a column that the markers follow as it is
         again = whole.copy()
         again[:, k] = raw[:, k]
-        if best < (BETTER if each.clear else MUCH_BETTER) * regression_error(again, motion):
-            doubtful[name] = each
-    return doubtful
+        if name in wraps and (error := regression_error(again, motion)) < BETTER * best:
+            whole, best = again, error
+            del wraps[name]
+    # Columns are compared together: of three cables, two determine where the third is.
+    clear = all(each.clear for each in wraps.values())
+    return wraps if best < (BETTER if clear else MUCH_BETTER) * regression_error(raw, motion) else {}
 
 
 class Restart(NamedTuple):

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of, unwrapped
+from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of, unwrapped, wraps_of
 from rfdropo_bayes.errors import InputError
 
 TIME = 0.04 * np.arange(400)
@@ -64,6 +64,15 @@ def test_counters_that_start_elsewhere_after_a_restart_are_doubtful(true):
     moved = true.copy()
     moved[200:] += 9000.0
     assert notes(moved, moved) == []
+
+
+def test_counters_of_three_cables_of_which_two_determine_the_third_are_read_on():
+    true = np.column_stack([WALK, -WALK.sum(axis=1)])
+    motion = Motion(TIME, TIME, true @ np.random.default_rng(1).normal(size=(3, 3)))
+    columns = [Column(f"c{k}", own, [360.0]) for k, own in enumerate((0.5 * true % 360.0).T)]
+    assert {name: each.turn for name, each in wraps_of(columns, motion).items()} == dict.fromkeys(
+        ("c0", "c1", "c2"), 360.0
+    )
 
 
 def test_values_are_read_on_and_missing_ones_stay_missing():
