@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rfdropo_bayes.data.format_descriptions import FORMATS
+from rfdropo_bayes.data.mapped_formats import FORMATS
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.robots import Robot, find_robot_file, known_robots

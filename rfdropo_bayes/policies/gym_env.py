@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from rfdropo_bayes.policies.building import make_episodes, spaces_of
+from rfdropo_bayes.policies.episodes import make_episodes, spaces_of
 from rfdropo_bayes.policies.rendering import picture
 from rfdropo_bayes.policies.tasks import PERIOD
 

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, ModelError, recorded_model_error
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -245,12 +245,3 @@ def session_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) 
         else:
             deviations.setdefault(info.scope.added_to, SessionDeviation(nothing, info.spread_of(values, len(nothing))))
     return deviations
-
-
-def draw_deviation(
-    deviation: ParameterInfo, values: Mapping[str, np.ndarray], key: PRNGKeyArray, count: int
-) -> Float[np.ndarray, " n"]:
-    """The deviation of an unseen group for each of ``count`` draws, from each draw's spread between groups, in the
-    parameter's unit.
-    """
-    return np.asarray(jax.random.normal(key, (count,))) * deviation.spread_of(values, count)

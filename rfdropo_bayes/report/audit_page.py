@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rfdropo_bayes.discrepancy.omnibus import BLOCK
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.score import likeness
-from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
+from rfdropo_bayes.discrepancy.score_tests import BLOCK, ScoreRow, ScoreTests
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.page import render
 from rfdropo_bayes.report.replay import Track, replay

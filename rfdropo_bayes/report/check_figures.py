@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rfdropo_bayes.report import style
-from rfdropo_bayes.report.coverage import TransformCurve
+from rfdropo_bayes.report.residuals import TransformCurve
 from rfdropo_bayes.report.scores import MILLIMETRES
 
 COLUMNS = 3

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
-from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
+from rfdropo_bayes.robots.parameter import Name, Pair, Positive, RobotTable
 
 _LEAST_LIMIT = 10.0  # [per mille]: drives report and limit torque in whole per mille, a tenth of this limit
 

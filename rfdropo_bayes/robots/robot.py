@@ -17,9 +17,8 @@ from rfdropo_bayes.robots.cable import Cable, Chamber, Channels, Motor
 from rfdropo_bayes.robots.catalogue import find_robot_file, robot_tables
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
 from rfdropo_bayes.robots.outline import RobotOutline, not_given, outlined_tables
-from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.robots.parameter import Name, Parameter, Positive, RobotTable, Vector
 from rfdropo_bayes.robots.plausibility import implausible
-from rfdropo_bayes.robots.table import Name, Positive, RobotTable, Vector
 from rfdropo_bayes.signatures import see_keywords, with_keywords_of
 from rfdropo_bayes.tables import changed, nearest, parse_table
 

@@ -17,7 +17,7 @@ from rfdropo_bayes.model.assembly import (
     measured_parameters,
     physical_values,
 )
-from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
+from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.policies.episodes import Episodes, Settings
@@ -161,8 +161,7 @@ def randomisation_of(
     fixed = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
     parts: list[Randomisation] = [Point(physical_values(fixed, simulator))]
     if isinstance(fit, Calibration):
-        fitted = fitted_integrator(fit.record.attrs, fit.folder)
-        check_fitted_integrator(fitted, simulator.integrator, where="fit")
+        check_fitted_integrator(fit.record.attrs, fit.folder, simulator.integrator, where="fit")
         rows = drawn_rows(fit.record, simulator.parameters, robot=simulator.robot)
         _check_parameters(fit.record, simulator, where="fit")
         parts.append(_with_fixed(_in_its_session(rows, fit.record, simulator), fit.record, simulator))
@@ -226,8 +225,7 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     if record is not None:
         _check_parameters(record, simulator, where=str(source))
     attributes = {} if record is None else record.attrs
-    fitted = fitted_integrator(attributes, folder)
-    check_fitted_integrator(fitted, simulator.integrator, where=str(source))
+    check_fitted_integrator(attributes, folder, simulator.integrator, where=str(source))
     return _with_fixed(randomisation, record, simulator)
 
 
