@@ -161,7 +161,7 @@ class CableGain(MemorylessActuation):
     name = "cable_gain"
     stage = "actuation"
     inside_drive = False
-    cause = "spools of different radius, or cables of different stretch"
+    cause = "spools of different radius, cables of different stretch, or a cable that slips or is torn"
     remedy = "measure the travel of each cable for one turn of its drive"
 
     def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
@@ -169,10 +169,10 @@ class CableGain(MemorylessActuation):
             ParameterSpec(
                 f"cable_gain_error_{channel}",
                 "-",
-                -0.9,
+                -1.0,  # a cable that does not pull at all
                 2.0,
                 0.0,
-                normal(0.1),
+                normal(0.2),
                 f"relative error of the displacement of {channel}",
             )
             for channel in channels
