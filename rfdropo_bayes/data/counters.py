@@ -3,6 +3,8 @@
 A wrapped counter has short steps, and steps of nearly a turn against the motion before and after. A real jump of the
 command looks the same, so the markers decide: their motion is regressed on the commands with and without the jumps. A
 jump is doubtful if the regression is better without it.
+
+Readings of sensors: missing readings, and readings that a slower loop repeats (a zero-order hold).
 """
 
 from __future__ import annotations

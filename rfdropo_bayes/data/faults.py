@@ -15,6 +15,12 @@ Five kinds, each with its pattern in the numbers:
 - *renamed*: the place of a marker under the name of another (`identities`).
 
 At low sampling rates ``max_acceleration * dt**2`` exceeds any motion: no row is masked then.
+
+Markers that change names: from a row on, a tracker gives the places of some markers under the names of others.
+
+An exchange of markers shows in one row: each exchanged marker is near the expected position of the other marker, and
+far from its own expected position. Two points of one body do not trade places within a row, so the change is certain;
+the rows do not show which names are right; the names at the beginning are taken.
 """
 
 from __future__ import annotations

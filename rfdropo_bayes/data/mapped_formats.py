@@ -1,4 +1,7 @@
-"""Formats whose columns may be anything, described by the table [data.columns]; and the kind of a file."""
+"""Formats whose columns may be anything, described by the table [data.columns]; and the kind of a file.
+
+One line on each format of recordings, to find the format of a given file.
+"""
 
 from __future__ import annotations
 

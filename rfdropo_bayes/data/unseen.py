@@ -1,6 +1,8 @@
 """Commands whose outcome is to be predicted, with at most the first row of measurements.
 
 All other measurements are masked here, so that no prediction can have seen it.
+
+Recordings given to a verb: checked to be a list.
 """
 
 from __future__ import annotations

@@ -3,6 +3,10 @@
 A difference is added to a value that all groups share. A base parameter is higher in one group, or a mechanism is
 present, larger or absent in one group only. A mechanism that all groups lack is a candidate as
 well, under its plain name: without it, an error of the base model could be taken for a difference between groups.
+
+Parameters of a robot that a model fixes at nominal values, as candidates of an audit.
+
+A parameter of the robot's own file that is not inferred, such as the zeros of all cables, may also explain a misfit.
 """
 
 from __future__ import annotations

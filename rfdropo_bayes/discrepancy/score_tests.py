@@ -3,6 +3,8 @@
 All p-values come from a parametric bootstrap: residuals are simulated under a right model. Noise is drawn for every
 recording, the noise model is estimated as for the data, and the base model is refitted linearly. No rollouts are
 needed.
+
+Whether anything is wrong at all: tests of the whitened residuals against independent unit normals, as one.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Many episodes of a task at once, each lane with its own parameters, goal, commands and age.
 
 Gymnasium and Stable-Baselines3 use different interfaces of an environment; `gym_env` and `vec_env` provide them.
+
+Gymnasium's spaces of a policy layout. Environments from a few names: task, mechanisms, randomisation.
 """
 
 from __future__ import annotations
@@ -11,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
@@ -436,8 +437,10 @@ def make_episodes(
     return Episodes(simulator, chosen, lanes, randomisation or Point(parameters or {}), Settings(**settings))
 
 
-def spaces_of(layout: PolicyLayout) -> tuple[spaces.Box, spaces.Space]:
+def spaces_of(layout: PolicyLayout) -> tuple[Any, Any]:
     """Observation and action space."""
+    from gymnasium import spaces  # it comes with an extra, which episodes do without
+
     observed = spaces.Box(-FAR, FAR, (layout.size,), np.float32)
     if layout.kind == "discrete":
         return observed, spaces.Discrete(len(layout.moves))

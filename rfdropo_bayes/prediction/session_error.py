@@ -3,6 +3,8 @@
 Parameters reduce the residuals of fitted recordings, but not the errors in another session. These errors are measured
 on sessions left out of the fit, in units of the fitted residuals. They are assumed proportional to the fitted residuals
 and to the distance that the robot moves.
+
+Deviation of a session, or another group of recordings, from the shared values of a posterior.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""report.html of an audit: one file that needs nothing else."""
+"""report.html of an audit: one file that needs nothing else.
+
+Residuals of the fitted recordings and signals at ports, as a dataset: the content of residuals.nc.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,8 @@
 regression on the commands.
 
 They use no model of the robot. A calibrated simulator that does not beat them has not earned its keep.
+
+Finite-impulse-response regression: positions as a ridge regression on the recent commands and their powers.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Figures of the run: errors beside the baselines, coverage of the bands, the sampler, when the model failed."""
+"""Figures of the run: errors beside the baselines, coverage of the bands, the sampler, when the model failed.
+
+Residuals of a fit at rest, as pictures: over time, against each command and its direction, and by marker.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""summary.json: the numbers of a run under names that other programs rely on."""
+"""summary.json: the numbers of a run under names that other programs rely on.
+
+Facts about a run beside its posterior: the plain input of summary.json and report.html.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Cables through guide points, and the channels that command them."""
+"""Cables through guide points, and the channels that command them.
+
+Chambers under pressure along part of the body, beside its axis. Motors that wind the cables: from length to counts,
+from torque to tension, and the limits of a motor.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Physical parameters of a robot: unit, nominal value, hard bounds and a default prior."""
+"""Physical parameters of a robot: unit, nominal value, hard bounds and a default prior.
+
+Base class of the tables of a robot file: no unknown keys, no infinities, immutable.
+"""
 
 from __future__ import annotations
 

@@ -5,6 +5,15 @@ phi holds a mean and a standard deviation per parameter; it maximises the likeli
 unless ``mended = false``: the horizon ends at the last row; the finalists (the best of every stage) are scored again at
 the FULL horizon with common random numbers, because losses at different horizons cannot be compared; and measurements
 have noise, whose variance is added to the rollouts' so that phi need not explain it.
+
+Score of a trajectory under a distribution.
+
+Eq. 2 and 3 of RF-DROPO: at every time step a Gaussian with the mean and covariance of rollouts drawn from it.
+
+Search space of RF-DROPO: independent truncated normals over simulator parameters, each coded by a vector.
+
+Vectors lie in [0, 4]^k, as the optimisers want them. Draws transform given uniform numbers, so that several vectors
+share their random numbers.
 """
 
 from __future__ import annotations
