@@ -2,7 +2,7 @@
 
 A walk starts at a function and follows its calls within the rooms of the question; a call into another room is one hop
 and is not followed. A method counts if one class alone has its name, in a module that the caller's module imports,
-directly or through others. ``--list`` prints every hop.
+directly or through others; methods of libraries, arrays and Python's own types do not. ``--list`` prints every hop.
 """
 
 from __future__ import annotations
@@ -12,12 +12,15 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 
+import numpy as np
+
 PACKAGE = Path(__file__).resolve().parents[1] / "rfdropo_bayes"
 WALKS = {  # question: its start, the rooms or modules that are followed, and the most hops
     "audit, from a problem to a verdict": ("discrepancy.pipeline", "audit", ("discrepancy",), 60),
     "predict, from a fit to bands": ("verbs.predict", "predict", ("verbs.predict", "prediction"), 40),
 }
 Place = tuple[str, str]
+COMMON = {name for kind in (np.ndarray, str, dict, list, set, Path) for name in dir(kind)}
 
 
 class Package:
@@ -28,6 +31,7 @@ class Package:
         self.names: dict[str, dict[str, Place]] = {}
         self.methods: defaultdict[str, list[Place]] = defaultdict(list)
         self.imports: defaultdict[str, set[str]] = defaultdict(set)
+        self.libraries: defaultdict[str, set[str]] = defaultdict(set)
         for path in PACKAGE.rglob("*.py"):
             module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
             self._read(module, ast.parse(path.read_text()))
@@ -44,6 +48,8 @@ class Package:
                     self.nodes[place] = member
                     self.methods[member.name].append(place)
         for node in ast.walk(tree):
+            if isinstance(node, ast.Import):
+                self.libraries[module] |= {alias.asname or alias.name for alias in node.names}
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rfdropo_bayes."):
                 source = str(node.module).removeprefix("rfdropo_bayes.")
                 names |= {alias.asname or alias.name: (source, alias.name) for alias in node.names}
@@ -69,7 +75,9 @@ class Package:
             if isinstance(part, ast.Name) and part.id in self.names[place[0]]:
                 found.add(self.names[place[0]][part.id])
             elif isinstance(part, ast.Attribute) and len(self.methods[part.attr]) == 1:
-                found |= {each for each in self.methods[part.attr] if each[0] in reached}
+                of_library = isinstance(part.value, ast.Name) and part.value.id in self.libraries[place[0]]
+                if not of_library and part.attr not in COMMON:
+                    found |= {each for each in self.methods[part.attr] if each[0] in reached}
         return {each for each in found if each in self.nodes and each != place}
 
 

@@ -36,15 +36,9 @@ from rfdropo_bayes.mechanisms.features import KINDS
 from rfdropo_bayes.mechanisms.registry import REGISTRY
 from rfdropo_bayes.model.assembly import measurement_specs
 from rfdropo_bayes.model.experiment import Experiment, NoiseModel
-from rfdropo_bayes.model.mechanism_listings import (
-    EXAMPLE_ROBOT,
-    first_paragraph,
-    format_rows,
-    mechanism_facts,
-    prior_text,
-    robot_rows,
-)
+from rfdropo_bayes.model.mechanism_listings import EXAMPLE_ROBOT, first_paragraph, mechanism_facts, prior_text
 from rfdropo_bayes.model.model_spec import DataChannels
+from rfdropo_bayes.model.robot_listings import format_rows, robot_rows
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.sections import SHAPES, SectionedBody
 from rfdropo_bayes.simulators.adapters.mujoco_elements import ATTRIBUTES, Attribute

@@ -1,4 +1,7 @@
-"""A simulator behind compiled programs: rollouts and their derivatives, lane by lane, in batches of few sizes."""
+"""A simulator behind compiled programs: rollouts and their derivatives, lane by lane, in batches of few sizes.
+
+Batches of any size through functions that are compiled for a few sizes.
+"""
 
 from __future__ import annotations
 

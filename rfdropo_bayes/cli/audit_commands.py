@@ -1,4 +1,8 @@
-"""Commands around the audit: effects that the simulator lacks, and the next experiment."""
+"""Commands around the audit: effects that the simulator lacks, and the next experiment.
+
+The command that describes an experiment before a long run. Commands that predict, and that take a calibration to
+another day.
+"""
 
 from __future__ import annotations
 

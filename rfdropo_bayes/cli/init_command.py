@@ -185,6 +185,7 @@ def init(
     defaults: Defaults = False,
 ) -> None:
     """Write a first robot file and experiment file. Asks for facts that are neither in options nor in recordings."""
+    from rfdropo_bayes.data.named_columns import FORMAT
     from rfdropo_bayes.verbs.column_names import guess_columns
     from rfdropo_bayes.verbs.init import (
         assumed_of_columns,
@@ -197,6 +198,7 @@ def init(
         with_turns,
         write_first_files,
     )
+    from rfdropo_bayes.verbs.split_files import split_files
 
     ask = Questions(sys.stdin.isatty() and not defaults)
     files = matching_recordings(recording or [])
@@ -210,6 +212,8 @@ def init(
     if folder.suffix in MODELS:
         _init_model(folder, files, sent, guess)
         return
+    split = {} if guess is None or guess.format != FORMAT or sent else split_files(folder, files, guess)
+    files = list(split) or files
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
     if unit not in UNITS:
         raise InputError(
@@ -237,7 +241,8 @@ def init(
     typer.echo(f"wrote {robot}\nwrote {experiment}")
     if ask.assumed:
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
-    for line in [*assumed_of_columns(guess), *_found_lines(robot, experiment)] if guess else []:
+    told = [words for words in split.values() if words]
+    for line in [*told, *assumed_of_columns(guess), *_found_lines(robot, experiment)] if guess else []:
         typer.echo(f"look over: {line}")
     typer.echo(f"next: {shlex.join(['rfdropo', 'check', str(folder / 'experiment.toml')])}")
 

@@ -14,7 +14,7 @@ ROBOT_HELP = "name of a robot, or path of a robot file, to describe"
 
 def robots(name: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help=ROBOT_HELP)] = None) -> None:
     """List the robots, or describe a robot. Its geometry, cables, markers and parameters."""
-    from rfdropo_bayes.model.mechanism_listings import named_robot_facts, robot_rows
+    from rfdropo_bayes.model.robot_listings import named_robot_facts, robot_rows
 
     if name is None:
         _show(robot_rows())
@@ -41,7 +41,7 @@ def mechanisms(
 
 def formats() -> None:
     """List the formats of recordings."""
-    from rfdropo_bayes.model.mechanism_listings import format_rows
+    from rfdropo_bayes.model.robot_listings import format_rows
 
     _show(format_rows())
 

@@ -3,6 +3,8 @@
 A wrapped counter has short steps, and steps of nearly a turn against the motion before and after. A real jump of the
 command looks the same, so the markers decide: their motion is regressed on the commands with and without the jumps. A
 jump is doubtful if the regression is better without it.
+
+Readings of sensors: missing readings, and readings that a slower loop repeats (a zero-order hold).
 """
 
 from __future__ import annotations
@@ -11,7 +13,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+import pandas as pd
+from jaxtyping import Bool, Float
+
+from rfdropo_bayes.data.sample_times import evenly_spaced, sample_time
+
+HELD = 1.5  # samples: readings that last longer are held
 
 SHORT, LONG = 0.35, 0.6
 """Steps of a counter that wraps are shorter or longer than these shares of a turn, and none lies between."""
@@ -20,6 +27,7 @@ SEVERAL = 2  # jumps that it takes to believe in a turn of no known counter
 EXCEPTIONAL = 3.0  # multiple of the 95 % quantile of step sizes above which a step may be a restart
 BETTER, MUCH_BETTER = 0.9, 0.5
 """Ratio of the errors without and with the jumps of a turn, and of a restart, below which markers did not follow."""
+FILLED = 0.8  # least share of a known turn over which values extend that wrap between rows far apart
 DELAYS = (0.0, 0.05, 0.1, 0.2, 0.4)  # [s] of the markers after the commands
 ROWS = 4000  # that a regression looks at, at most
 POWERS = tuple(2.0**k for k in range(8, 33))  # turns of counters in whole numbers
@@ -31,6 +39,7 @@ class Wraps(NamedTuple):
     rows: tuple[int, ...]  # after the jumps
     turn: float  # turn of the counter, in the unit of the column
     known: bool  # whether this is the turn of a known counter; else it is estimated from the jumps
+    clear: bool = True  # whether no step is of a length between the jumps and the motion beside them
 
 
 class Column(NamedTuple):
@@ -75,7 +84,7 @@ def turns_of(unit: str, counts_per_turn: float | None, values: np.ndarray) -> li
 
 def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wraps | None:
     """Jumps of about one turn relative to the motion before and after; None without jumps, or if steps of all lengths
-    occur.
+    occur in values that do not fill a known turn.
 
     Args:
         values: values of one column; missing values are skipped.
@@ -96,10 +105,19 @@ def find_wraps(values: Float[np.ndarray, " rows"], turns: Sequence[float]) -> Wr
     continued = np.abs(size[jump] - turn).max() <= 1.5 * usual
     within = extent <= 1.01 * turn
     if not (continued and within) or usual > SHORT * turn or size[jump].min() < LONG * turn:
-        return None
+        return _folded(values, rows, turns)
     if not near and np.count_nonzero(jump) < SEVERAL:
         return None
     return Wraps(tuple(int(row) for row in rows[1:][jump]), turn, bool(near))
+
+
+def _folded(values: np.ndarray, rows: np.ndarray, turns: Sequence[float]) -> Wraps | None:
+    """Jumps by over half a known turn that the values fill, if the steps between these are too long to tell."""
+    extent, jump = float(np.ptp(values[rows])), np.abs(np.diff(values[rows]))
+    filled = [turn for turn in turns if FILLED * turn <= extent <= turn and np.any(jump > 0.5 * turn)]
+    if not filled:
+        return None
+    return Wraps(tuple(int(row) for row in rows[1:][jump > 0.5 * filled[0]]), filled[0], known=True, clear=False)
 
 
 def _towards(step: np.ndarray, k: int, short: np.ndarray) -> float:
@@ -115,20 +133,20 @@ def wraps_of(columns: Sequence[Column], motion: Motion) -> dict[str, Wraps]:
     together = len(wraps) > 1 and len({row for each in wraps.values() for row in each.rows}) == 1
     if not wraps or together:  # counters that jump together, and once, were started anew
         return {}
-    names = [column.name for column in columns]
     raw = np.stack([column.values for column in columns], axis=1)
-    whole = raw.copy()
+    whole, numbers = raw.copy(), {column.name: k for k, column in enumerate(columns)}
     for name, each in wraps.items():
-        whole[:, names.index(name)] = unwrapped(raw[:, names.index(name)], each.turn)
+        whole[:, numbers[name]] = unwrapped(raw[:, numbers[name]], each.turn)
     best = regression_error(whole, motion)
-    doubtful = {}
-    for name, each in wraps.items():
-        k = names.index(name)
+    for name, k in numbers.items():  # a column that the markers follow as it is
         again = whole.copy()
         again[:, k] = raw[:, k]
-        if best < BETTER * regression_error(again, motion):
-            doubtful[name] = each
-    return doubtful
+        if name in wraps and (error := regression_error(again, motion)) < BETTER * best:
+            whole, best = again, error
+            del wraps[name]
+    # Columns are compared together: of three cables, two determine where the third is.
+    clear = all(each.clear for each in wraps.values())
+    return wraps if best < (BETTER if clear else MUCH_BETTER) * regression_error(raw, motion) else {}
 
 
 class Restart(NamedTuple):
@@ -220,3 +238,40 @@ def quoted_key(name: str) -> str:
     plain = name and all(letter.isascii() and (letter.isalnum() or letter in "_-") for letter in name)
     escaped = name.replace("\\", "\\\\").replace('"', '\\"')
     return name if plain else f'"{escaped}"'
+
+
+def present_readings(reading: np.ndarray | None) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Readings with NaN replaced by the last (or else the next) reading, and a mask of measured readings.
+
+    The mask is None if nothing is missing.
+    """
+    values = None if reading is None else np.array(reading, dtype=float)
+    if values is None or values.ndim != 2 or np.isfinite(values).all():
+        return reading, None
+    present = np.isfinite(values)
+    filled = pd.DataFrame(np.where(present, values, np.nan)).ffill().bfill().fillna(0.0)
+    return filled.to_numpy(), present
+
+
+def hold_time(time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time channel"]) -> float:
+    """Median time for which a reading is repeated [s]; 0 if there are too few changes."""
+    changes = np.flatnonzero(_changed(np.asarray(present_readings(reading)[0])))
+    return float(np.median(np.diff(evenly_spaced(time)[changes]))) if changes.size > 2 else 0.0
+
+
+def new_readings(
+    time: Float[np.ndarray, " time"], reading: Float[np.ndarray, "time channel"], hold: float
+) -> Bool[np.ndarray, "time channel"]:
+    """Mask of readings that were made since the previous row.
+
+    All readings are new unless they last for longer than the sample time. A change of any channel marks a new held
+    reading, because all channels are read together. The first row counts as held. A new reading that equals the last in
+    every channel goes unnoticed, which loses only repeated readings of a drive at rest.
+    """
+    if hold <= HELD * sample_time(time):
+        return np.ones(reading.shape, dtype=bool)
+    return np.broadcast_to(_changed(reading)[:, None], reading.shape).copy()
+
+
+def _changed(reading: Float[np.ndarray, "time channel"]) -> Bool[np.ndarray, " time"]:
+    return np.concatenate([[False], (np.diff(reading, axis=0) != 0.0).any(axis=1)])

@@ -89,17 +89,18 @@ def _holds_values(line: str, separator: str) -> bool:
     return len(cells) > 1 and 2 * sum(is_value(cell) for cell in cells) > len(cells)
 
 
-def _fit(lines: Sequence[str], separator: str) -> tuple[bool, float, int, int]:
-    """Score of a separator: whether there is more than one column, the share and number of numeric cells, and the
-    names.
+def _fit(lines: Sequence[str], separator: str) -> tuple[bool, float, int, bool, int]:
+    """Score of a separator: whether there is more than one column, the share and number of numeric cells, whether each
+    column has a name, and the number of names.
     """
     names = len(cells_of(lines[0], separator))
     rows = [cells_of(line, separator) for line in lines[1 : SAMPLED + 1] or lines if line.strip()]
     cells = [cell for row in rows for cell in row]
     values = sum(is_value(cell) for cell in cells)
     if separator == " " and not values:  # words of any text
-        return False, 0.0, 0, 0
-    return max(names, *map(len, rows), 0) > 1, values / max(len(cells), 1), values, names
+        return False, 0.0, 0, False, 0
+    named = bool(rows) and names == len(rows[0])
+    return max(names, *map(len, rows), 0) > 1, values / max(len(cells), 1), values, named, names
 
 
 def is_value(cell: str) -> bool:

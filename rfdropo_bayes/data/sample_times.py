@@ -191,9 +191,11 @@ def _of_groups(time: np.ndarray, gaps: np.ndarray) -> float:
 
 
 def row_interval(time: Float[np.ndarray, " rows"]) -> float:
-    """Time from row to row [s], the median of means over many rows: deliveries and single gaps do not change it."""
+    """Time from row to row [s], the median of means over many rows: deliveries, single gaps and clocks that begin anew
+    do not change it."""
     window = _window(time)
-    return float(np.median(time[window:] - time[:-window])) / window
+    gaps = time[window:] - time[:-window]
+    return float(np.median(gaps[gaps > 0.0] if np.any(gaps > 0.0) else gaps)) / window
 
 
 def _window(time: np.ndarray) -> int:

@@ -1,4 +1,8 @@
-"""The control loop: set-points out and status in at every cycle, and every phase of a session from enabling to rest."""
+"""The control loop: set-points out and status in at every cycle, and every phase of a session from enabling to rest.
+
+Set-points: lengths within every motor's limits on length, rate and acceleration, for any commands. Detection of faults
+that end a running session, in the drives, the bus and the clock.
+"""
 
 from __future__ import annotations
 

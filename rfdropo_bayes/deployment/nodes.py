@@ -1,4 +1,7 @@
-"""A CANopen node as the master sees it: data sheet, SDOs and heartbeat, which all axes of one drive share."""
+"""A CANopen node as the master sees it: data sheet, SDOs and heartbeat, which all axes of one drive share.
+
+Electronic data sheets (EDS) of drives; the simulated drive's sheet has any requested number of axes.
+"""
 
 from __future__ import annotations
 

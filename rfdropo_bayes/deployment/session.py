@@ -1,4 +1,7 @@
-"""One session: check the drives, home them, run a policy on them, watch it in the shadow, or replay a recording."""
+"""One session: check the drives, home them, run a policy on them, watch it in the shadow, or replay a recording.
+
+Homing by tension: each cable is pulled slowly until it carries its homing tension, which defines length zero.
+"""
 
 from __future__ import annotations
 

@@ -146,8 +146,8 @@ def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tu
             search.report(f"{best} takes the place of {step.name}")
             members = (best, *(name for name in tied if name != best))
             members += (step.name,) if own > gains[best] - rules.evidence else ()
-            place = Added(best, members, tests, fits[best], gains[best], gains, last.fit_target)
-            return simplified(search, base, (*without(search, steps, index, base), place))
+            simple = Added(best, members, tests, fits[best], gains[best], gains, last.fit_target)
+            return simplified(search, base, (*without(search, steps, index, base), simple))
         if further := [name for name in tied if name not in step.members]:
             kept = replace(step, members=(*step.members, *further))
             steps = (*steps[:index], kept, *steps[index + 1 :])

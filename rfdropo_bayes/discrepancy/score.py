@@ -86,12 +86,3 @@ def likeness(first: Signature, second: Signature) -> float:
     if first.sign and second.sign:
         return float(first.sign * second.sign * (first.basis[:, 0] @ second.basis[:, 0]))
     return float(np.linalg.svd(first.basis.T @ second.basis, compute_uv=False)[-1])
-
-
-def classes(marks: list[Signature], limit: float) -> list[list[int]]:
-    """For each signature the indistinguishable signatures: likeness above ``limit``, itself first."""
-    classes_found = []
-    for i, mark in enumerate(marks):
-        others = [j for j, other in enumerate(marks) if j != i and likeness(mark, other) > limit]
-        classes_found.append([i, *others])
-    return classes_found

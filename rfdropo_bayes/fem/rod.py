@@ -3,6 +3,8 @@
 A rod has six unknowns a station: the position of the centre line and the rotation of the section. A section does not
 deform: guides, markers and loads sit rigidly on sections. Between stations the centre line is Hermite's cubic through
 both stations and along both sections' normals, so a point there is a weighted sum of positions and of rotated arms.
+
+Positions of material points of a rod in space.
 """
 
 from __future__ import annotations

@@ -11,6 +11,8 @@ functions at rest, H = sum_a (Q' x_a - X_a) (x) g_a and S the isotropic law. Two
 
 Constant-strain tetrahedra are stiff in bending and lock near incompressibility: they reproduce meshes of other
 simulators, and are not accurate with few unknowns.
+
+Material points of a mesh and cables through them: weighted sums of the places of nodes.
 """
 
 from __future__ import annotations

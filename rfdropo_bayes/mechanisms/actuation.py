@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -93,6 +94,61 @@ class CommandDelay:
         return (last, step), reached
 
 
+class CableDelay:
+    """Each command acts by its own delay late; zero at null. Equal delays of all are `command_delay`'s.
+
+    Args:
+        channels: names of the command channels; numbers by default.
+    """
+
+    name = "cable_delay"
+    stage = "actuation"
+    inside_drive = True
+    cause = "a drive that answers later than others: its bus, its controller, or its own filter"
+    remedy = "command all drives at once, and compare the stamps of their first motion"
+
+    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
+        self.parameters = tuple(
+            ParameterSpec(f"cable_delay_{channel}", "s", 0.0, 2.0, 0.0, half_normal(0.1), f"delay of {channel}")
+            for channel in channels
+        )
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> CableDelay:
+        """One delay for every command channel of a robot."""
+        return cls(robot.channel_names)
+
+    def actuate(
+        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
+    ) -> Float[Array, "step channel"]:
+        """Read each command its delay earlier, linearly between steps."""
+        history = jnp.concatenate([initial[None], command])
+        return self._late(values, time_step, jnp.arange(1, len(history)), history)
+
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """Commands of the last steps, as far back as a delay may reach, and the number of steps."""
+        steps = math.ceil(self.parameters[0].high / interval) + 2
+        return jnp.broadcast_to(first, (steps, *first.shape)), jnp.zeros((), int)
+
+    def advance(
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
+        """Read each command its delay earlier; the oldest one is overwritten."""
+        last, step = memory[0], memory[1] + 1
+        last = last.at[step % len(last)].set(given)
+        return (last, step), self._late(values, now, step, last)
+
+    def _late(
+        self, values: Values, interval: float, step: Int[Array, "*step"], history: Float[Array, "kept channel"]
+    ) -> Float[Array, "*step channel"]:
+        delay = jnp.stack([values[spec.name] for spec in self.parameters[: history.shape[1]]])
+
+        def own(late: Float[Array, ""], past: Float[Array, " kept"]) -> Float[Array, "*step"]:
+            return _read_late(step, late, lambda at: past[at % len(past)][..., None])[..., 0]
+
+        return jax.vmap(own, in_axes=(0, 1), out_axes=-1)(delay / interval, history)
+
+
 def _read_late(
     step: Int[Array, "*step"],
     late: Float[Array, ""],
@@ -161,7 +217,7 @@ class CableGain(MemorylessActuation):
     name = "cable_gain"
     stage = "actuation"
     inside_drive = False
-    cause = "spools of different radius, or cables of different stretch"
+    cause = "spools of different radius, cables of different stretch, or a cable that slips or is torn"
     remedy = "measure the travel of each cable for one turn of its drive"
 
     def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
@@ -169,10 +225,10 @@ class CableGain(MemorylessActuation):
             ParameterSpec(
                 f"cable_gain_error_{channel}",
                 "-",
-                -0.9,
+                -1.0,  # a cable that does not pull at all
                 2.0,
                 0.0,
-                normal(0.1),
+                normal(0.2),
                 f"relative error of the displacement of {channel}",
             )
             for channel in channels

@@ -5,6 +5,8 @@ lengths scale with the pull of usual commands, other lengths with the body's len
 Forces scale with the tension (or thrust of a chamber) that bends the body by a usual pull: the pull times Young's
 modulus over the integral of ``radius^2 / I`` along the cable. Times, angles and ratios stay, and so does the density of
 a fluid around the body.
+
+Default priors of mechanisms, as the tables of an experiment file; scales are in the parameter's unit.
 """
 
 from __future__ import annotations

@@ -22,27 +22,24 @@ def stated_integrator(spec: ModelSpec) -> dict[str, str]:
     return {} if integrator is None else {INTEGRATOR: integrator}
 
 
-def fitted_integrator(attributes: Mapping[str, Any], folder: Path | None = None) -> str | None:
-    """Integrator of a fit; None if neither states it.
+def check_fitted_integrator(
+    attributes: Mapping[str, Any], folder: Path | None, integrator: str | None, *, where: str
+) -> None:
+    """Check that a model uses the integrator of the fit whose posterior it uses.
 
     Args:
         attributes: attributes of the posterior.
         folder: folder of the run; its config.toml is used if the attributes lack the integrator.
-    """
-    if INTEGRATOR in attributes:
-        return str(attributes[INTEGRATOR])
-    if folder is None or not (folder / CONFIG).is_file():
-        return None
-    simulator = read_tables(folder / CONFIG).get("simulator", {})
-    return QUASI_STATIC if simulator.get("motion") == QUASI_STATIC else simulator.get(INTEGRATOR)
-
-
-def check_fitted_integrator(fitted: str | None, integrator: str | None, *, where: str) -> None:
-    """Check that a model uses the integrator of the fit whose posterior it uses; None is unknown, or a black box.
+        integrator: integrator of the model; None for a black box.
+        where: place of the model in an error.
 
     Raises:
-        InputError: it does not.
+        InputError: it uses another.
     """
+    fitted = attributes.get(INTEGRATOR)
+    if fitted is None and folder is not None and (folder / CONFIG).is_file():
+        simulator = read_tables(folder / CONFIG).get("simulator", {})
+        fitted = QUASI_STATIC if simulator.get("motion") == QUASI_STATIC else simulator.get(INTEGRATOR)
     if None not in (fitted, integrator) and integrator != fitted:
         key = "motion" if fitted == QUASI_STATIC else "integrator"
         raise InputError(

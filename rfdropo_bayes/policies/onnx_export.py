@@ -5,6 +5,12 @@ channel) is the change of each channel's command per control period [m or rad]. 
 takes it: a number from -1 to 1 for every channel, or the index of a discrete action (batch by 1). The metadata hold the
 layout (`PolicyLayout.to_json`) and the origin of the policy. The graph is built node by node: PyTorch's own exporter
 needs one more package, and would leave the normalisation out.
+
+Comparison of exported policies with their models, before and after training.
+
+Some options of an algorithm change the network in ways that an export may not follow. A failure after hours of training
+is avoided: the untrained policy is exported and compared first, as it is and with random weights, because an untrained
+policy's actions are near zero, and hide a missing tanh or limit.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""report.html of a training: learning curve, success rate, draws for which the policy fails, and next steps."""
+"""report.html of a training: learning curve, success rate, draws for which the policy fails, and next steps.
+
+Figures of policies: the learning curve, and success rates against distance.
+"""
 
 from __future__ import annotations
 

@@ -6,14 +6,9 @@ NAMES = ("TrunkReach-v0", "TrunkPush-v0")
 
 
 def register() -> None:
-    """Register the tasks for ``gymnasium.make`` and ``gymnasium.make_vec``."""
+    """Register the tasks for ``gymnasium.make``."""
     import gymnasium
 
     for name in NAMES:
         if name not in gymnasium.registry:
-            gymnasium.register(
-                name,
-                entry_point="rfdropo_bayes.policies.gym_env:TrunkEnv",
-                vector_entry_point="rfdropo_bayes.policies.gym_env:TrunkVectorEnv",
-                kwargs={"task": name},
-            )
+            gymnasium.register(name, entry_point="rfdropo_bayes.policies.gym_env:TrunkEnv", kwargs={"task": name})

@@ -3,6 +3,8 @@
 At the end of a leg the policy is evaluated on the same cases as before, and everything is saved. The next leg begins
 with all environments reset and all generators seeded by the run's seed and the leg's number, in the same or a new
 process. The learning curve therefore does not depend on interruptions.
+
+Options of the training algorithm, PPO of Stable-Baselines3, checked before anything is simulated.
 """
 
 from __future__ import annotations
@@ -309,14 +311,12 @@ def _load_state(folder: Path, known: Mapping[str, Any]) -> dict[str, Any] | None
     absent += [which + name for which in (LAST, BEST) for name in files if not (folder / (which + name)).exists()]
     if absent:
         raise InputError(
-            f"the checkpoint lacks {', '.join(absent)}: it is damaged, or of an earlier version",
+            f"the checkpoint lacks {', '.join(absent)}: it is damaged",
             where=str(folder),
             remedy="start anew: give --overwrite, not --resume",
         )
     before = json.loads(json.dumps(state["known"]))
     now = json.loads(json.dumps(known))
-    # Keys that a checkpoint lacks have their default.
-    before["table"] = TrainingTable().model_dump(mode="json") | before["table"]
     changed = [name for name in now if name != "table" and now[name] != before.get(name)]
     changed += [name for name in now["table"] if name != "steps" and now["table"][name] != before["table"].get(name)]
     if changed:

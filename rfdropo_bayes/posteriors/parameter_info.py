@@ -1,4 +1,8 @@
-"""Facts about an inferred parameter, and its owner (a recording, a group or none)."""
+"""Facts about an inferred parameter, and its owner (a recording, a group or none).
+
+Whether draws are piled up at a bound, for bounds of any width, or lie in a region of little prior mass. Named
+quantities that are functions of the parameters, such as the ratio of stiffness to density.
+"""
 
 from __future__ import annotations
 

@@ -55,34 +55,54 @@ def fit_own(
     draws, (count, k) = np.arange(len(centre)), centre.shape
     point = (centre if start is None else start).copy()
     value, damping = residuals(point, draws), np.full(count, FIRST_DAMPING)
-    todo, step = draws[np.isfinite(value).all(axis=1)], 0
     converged, own = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     slope = np.zeros((*value.shape, k))
+
+    def solve(matrices: Float[np.ndarray, "n k k"], vectors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
+        return np.linalg.solve(matrices, vectors[..., None])[..., 0]
+
+    def costs(
+        value: Float[np.ndarray, "n m"], point: Float[np.ndarray, "n k"], draws: Int[np.ndarray, " n"]
+    ) -> Float[np.ndarray, " n"]:
+        cost = 0.5 * np.sum(value**2, axis=1) + 0.5 * np.sum((point - centre[draws]) ** 2, axis=1)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def slopes(draws: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n m k"]:
+        """Central differences along every coordinate, all draws and directions in one batch."""
+        moved = np.concatenate([point[draws] + sign * STEP * row for row in np.eye(k) for sign in (1.0, -1.0)])
+        values = residuals(moved, np.tile(draws, 2 * k)).reshape(k, 2, len(draws), -1)
+        return np.moveaxis((values[:, 0] - values[:, 1]) / (2.0 * STEP), 0, 2)
+
+    todo, step = draws[np.isfinite(value).all(axis=1)], 0
     if len(todo):
-        slope[:] = _slopes(residuals, point[todo[:1]], todo[:1])
+        slope[:] = slopes(todo[:1])
     while len(todo) and step < MOST_STEPS:
         gradient = np.einsum("nij,ni->nj", slope[todo], value[todo]) + (point - centre)[todo]
         curvature = np.einsum("nij,nik->njk", slope[todo], slope[todo]) + np.eye(k)
-        promised = 0.5 * np.einsum("nj,nj->n", gradient, _solve(curvature, gradient))
-        going, delivered = todo[promised >= TOLERANCE], np.zeros(count)
-        if len(going):
-            before, chosen = _cost(value[going], point[going], centre[going]), promised >= TOLERANCE
-            moved, moved_value, damping[going] = _step(
-                residuals,
-                point[going],
-                value[going],
-                damping[going],
-                centre[going],
-                gradient[chosen],
-                curvature[chosen],
-                going,
-            )
+        promised = 0.5 * np.einsum("nj,nj->n", gradient, solve(curvature, gradient))
+        chosen = promised >= TOLERANCE
+        going, delivered = todo[chosen], np.zeros(count)
+        if len(going):  # the least damped step that lowers each cost; unchanged if none does
+            before, waiting = costs(value[going], point[going], going), np.arange(len(going))
+            down, bent, first = gradient[chosen], curvature[chosen], damping[going]
+            diagonal = np.einsum("njj->nj", bent)[:, None] * np.eye(k)
+            moved, moved_value = point[going], value[going]
+            for factor in DAMPINGS:
+                damping[going[waiting]] = np.maximum(factor * first[waiting], LEAST_DAMPING)
+                damped = bent[waiting] + damping[going[waiting], None, None] * diagonal[waiting]
+                ahead = point[going[waiting]] - solve(damped, down[waiting])
+                ahead_value = residuals(ahead, going[waiting])
+                better = costs(ahead_value, ahead, going[waiting]) < before[waiting]
+                moved[waiting[better]], moved_value[waiting[better]] = ahead[better], ahead_value[better]
+                waiting = waiting[~better]
+                if not len(waiting):
+                    break
             way = moved - point[going]  # Broyden's update; derivatives of a draw that has not moved are unchanged
             missing = moved_value - value[going] - np.einsum("nij,nj->ni", slope[going], way)
             length = np.sum(way**2, axis=1)
             slope[going] += missing[:, :, None] * (way / np.where(length > 0.0, length, 1.0)[:, None])[:, None]
             point[going], value[going] = moved, moved_value
-            delivered[going] = before - _cost(moved_value, moved, centre[going])
+            delivered[going] = before - costs(moved_value, moved, going)
         still = delivered[todo] < TOLERANCE
         # Six decades of damping without gain: the gain predicted by differences is rounding, or the edge of a cliff.
         lost = todo[still & own[todo] & (promised >= CREDIBLE * TOLERANCE) & (damping[todo] >= MOST_DAMPING)]
@@ -94,53 +114,9 @@ def fit_own(
         todo, kept = todo[active], kept[active]
         anew = todo[~kept & ~own[todo]]
         if len(anew):
-            slope[anew] = _slopes(residuals, point[anew], anew)
+            slope[anew] = slopes(anew)
             own[anew], damping[anew] = True, FIRST_DAMPING
             todo = todo[np.isfinite(slope[todo]).all(axis=(1, 2))]
         step += 1
         report(step, float(np.mean(converged)))
     return OwnFit(point, value, slope, converged, step)
-
-
-def _step(
-    residuals: Residuals,
-    point: Float[np.ndarray, "n k"],
-    value: Float[np.ndarray, "n m"],
-    damping: Float[np.ndarray, " n"],
-    centre: Float[np.ndarray, "n k"],
-    gradient: Float[np.ndarray, "n k"],
-    curvature: Float[np.ndarray, "n k k"],
-    draws: Int[np.ndarray, " n"],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, residuals and dampings after the least damped step that lowers each cost; unchanged if none does."""
-    before, waiting = _cost(value, point, centre), np.arange(len(point))
-    diagonal = np.einsum("njj->nj", curvature)[:, None] * np.eye(point.shape[1])
-    point, value, tried = point.copy(), value.copy(), damping.copy()
-    for factor in DAMPINGS:
-        tried[waiting] = np.maximum(factor * damping[waiting], LEAST_DAMPING)
-        damped = curvature[waiting] + tried[waiting, None, None] * diagonal[waiting]
-        moved = point[waiting] - _solve(damped, gradient[waiting])
-        moved_value = residuals(moved, draws[waiting])
-        better = _cost(moved_value, moved, centre[waiting]) < before[waiting]
-        point[waiting[better]], value[waiting[better]] = moved[better], moved_value[better]
-        waiting = waiting[~better]
-        if not len(waiting):
-            break
-    return point, value, tried
-
-
-def _slopes(residuals: Residuals, point: Float[np.ndarray, "n k"], draws: Int[np.ndarray, " n"]) -> np.ndarray:
-    """Central differences along every coordinate (n, m, k), all draws and directions in one batch."""
-    n, k = point.shape
-    moved = np.concatenate([point + sign * STEP * row for row in np.eye(k) for sign in (1.0, -1.0)])
-    values = residuals(moved, np.tile(draws, 2 * k)).reshape(k, 2, n, -1)
-    return np.moveaxis((values[:, 0] - values[:, 1]) / (2.0 * STEP), 0, 2)
-
-
-def _cost(value: np.ndarray, point: np.ndarray, centre: np.ndarray) -> Float[np.ndarray, " n"]:
-    cost = 0.5 * np.sum(value**2, axis=1) + 0.5 * np.sum((point - centre) ** 2, axis=1)
-    return np.where(np.isfinite(cost), cost, np.inf)
-
-
-def _solve(matrices: Float[np.ndarray, "n k k"], vectors: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-    return np.linalg.solve(matrices, vectors[..., None])[..., 0]

@@ -36,7 +36,7 @@ from rfdropo_bayes.groups import Patterns, gather_groups, whole
 from rfdropo_bayes.posteriors import RecordingPrediction, Scope
 from rfdropo_bayes.prediction.first_row import first_row_distances, match_first_row, resampled_by_first_row
 from rfdropo_bayes.prediction.model_error import ModelError
-from rfdropo_bayes.prediction.session_error import SessionError, draw_deviation
+from rfdropo_bayes.prediction.session_error import SessionError
 from rfdropo_bayes.simulators.protocol import Result
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 
@@ -238,8 +238,9 @@ def draw_extended(extension: Extension, values: Batch, names: Sequence[str], key
     for number, parameter in enumerate(extension.scopes.parameters):
         like = extension.like[parameter.name]
         if not like:
-            own_key = jax.random.fold_in(key, len(names) + number)
-            extended[parameter.name] = draw_deviation(parameter.info, values, own_key, count)
+            # the deviation of an unseen group, from each draw's spread between groups
+            own_key, spread = jax.random.fold_in(key, len(names) + number), parameter.info.spread_of(values, count)
+            extended[parameter.name] = np.asarray(jax.random.normal(own_key, (count,))) * spread
         elif len(like) == 1:
             extended[parameter.name] = values[like[0]]
         else:

@@ -3,6 +3,8 @@
 Parameters reduce the residuals of fitted recordings, but not the errors in another session. These errors are measured
 on sessions left out of the fit, in units of the fitted residuals. They are assumed proportional to the fitted residuals
 and to the distance that the robot moves.
+
+Deviation of a session, or another group of recordings, from the shared values of a posterior.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO, ModelError, recorded_model_error
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
@@ -245,12 +247,3 @@ def session_deviations(record: PosteriorRecord, specs: Sequence[ParameterSpec]) 
         else:
             deviations.setdefault(info.scope.added_to, SessionDeviation(nothing, info.spread_of(values, len(nothing))))
     return deviations
-
-
-def draw_deviation(
-    deviation: ParameterInfo, values: Mapping[str, np.ndarray], key: PRNGKeyArray, count: int
-) -> Float[np.ndarray, " n"]:
-    """The deviation of an unseen group for each of ``count`` draws, from each draw's spread between groups, in the
-    parameter's unit.
-    """
-    return np.asarray(jax.random.normal(key, (count,))) * deviation.spread_of(values, count)

@@ -1,4 +1,7 @@
-"""report.html of an audit: one file that needs nothing else."""
+"""report.html of an audit: one file that needs nothing else.
+
+Residuals of the fitted recordings and signals at ports, as a dataset: the content of residuals.nc.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from rfdropo_bayes.discrepancy.omnibus import BLOCK
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.score import likeness
-from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
+from rfdropo_bayes.discrepancy.score_tests import BLOCK, ScoreRow, ScoreTests
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.page import render
 from rfdropo_bayes.report.replay import Track, replay

@@ -1,4 +1,7 @@
-"""Figures of the run: errors beside the baselines, coverage of the bands, the sampler, when the model failed."""
+"""Figures of the run: errors beside the baselines, coverage of the bands, the sampler, when the model failed.
+
+Residuals of a fit at rest, as pictures: over time, against each command and its direction, and by marker.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from rfdropo_bayes.report import style
-from rfdropo_bayes.report.coverage import TransformCurve
+from rfdropo_bayes.report.residuals import TransformCurve
 from rfdropo_bayes.report.scores import MILLIMETRES
 
 COLUMNS = 3

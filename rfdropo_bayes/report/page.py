@@ -16,9 +16,9 @@ from rfdropo_bayes.discrepancy.score_tests import p_in_words
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
 from rfdropo_bayes.posteriors.parameter_info import PILED
 from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures
-from rfdropo_bayes.report.coverage import coverage, transform_curve
 from rfdropo_bayes.report.headline import best_baseline
 from rfdropo_bayes.report.replay import replay, tracks_of
+from rfdropo_bayes.report.residuals import coverage, transform_curve
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
 from rfdropo_bayes.report.style import Picture, embed

@@ -3,6 +3,13 @@
 The LAST marker is the headline. A recording that ends at rest is also scored in two parts, since a long rest would
 dominate the score: the moving part (all rows before the pose has settled) and the final pose (the mean of the last
 rows).
+
+Scores of the predicted final position of a pushed object, as a distribution, compared with its repeats.
+
+The energy score E|X - y| - E|X - X'| / 2 of a predicted distribution X and an outcome y is smallest in expectation for
+the true distribution (Gneiting and Raftery 2007, eq. 21), and the distance |x - y| if X is a point. Contact is chaotic,
+so that no point prediction is possible. Both expectations are unbiased averages over draws, so that ensembles of
+different sizes compare (Ferro 2014).
 """
 
 from __future__ import annotations

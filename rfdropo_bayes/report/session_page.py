@@ -1,4 +1,7 @@
-"""report.html of a motor session: end, tracking by the drives, punctuality, next steps."""
+"""report.html of a motor session: end, tracking by the drives, punctuality, next steps.
+
+Figures of a motor session: cables beside their set-points, commands, the way to the goal, and punctuality.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Units and names as people read them."""
+"""Units and names as people read them.
+
+Verdicts of several sentences, for a line each.
+"""
 
 from __future__ import annotations
 

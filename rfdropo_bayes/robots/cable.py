@@ -1,4 +1,8 @@
-"""Cables through guide points, and the channels that command them."""
+"""Cables through guide points, and the channels that command them.
+
+Chambers under pressure along part of the body, beside its axis. Motors that wind the cables: from length to counts,
+from torque to tension, and the limits of a motor.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
-from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
+from rfdropo_bayes.robots.parameter import Name, Pair, Positive, RobotTable
 
 _LEAST_LIMIT = 10.0  # [per mille]: drives report and limit torque in whole per mille, a tenth of this limit
 

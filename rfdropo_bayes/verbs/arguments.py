@@ -1,4 +1,7 @@
-"""Checks of the models and calibrations given to a verb."""
+"""Checks of the models and calibrations given to a verb.
+
+A budget in minutes, converted to rollouts on the present machine.
+"""
 
 from __future__ import annotations
 

@@ -25,10 +25,9 @@ from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
-from rfdropo_bayes.discrepancy.differences import Groups, with_differences
+from rfdropo_bayes.discrepancy.differences import Groups, OwnParameter, with_differences, with_fixed_quantities
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Rules
 from rfdropo_bayes.discrepancy.fit import widening
-from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, with_fixed_quantities
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.law_words import law_tables
 from rfdropo_bayes.discrepancy.pipeline import Answer

@@ -69,7 +69,7 @@ from rfdropo_bayes.report.scores import score_objects
 from rfdropo_bayes.report.summary import read_summary
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot, robot_shape
-from rfdropo_bayes.robots.plausibility import implausible_values
+from rfdropo_bayes.robots.robot import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
 from rfdropo_bayes.verbs.arguments import MOST_DRAWS, budget_within, given_model, rollout_seconds
 from rfdropo_bayes.verbs.left_out_sessions import (

@@ -24,14 +24,14 @@ from rfdropo_bayes.inference.progress import say_step
 from rfdropo_bayes.mechanisms import mechanisms_named
 from rfdropo_bayes.model.assembly import build_model, build_simulator, with_drives
 from rfdropo_bayes.model.experiment import ROLLOUTS, AuditTable, Experiment, InferenceTable, load_experiment
-from rfdropo_bayes.model.mechanism_listings import robot_facts, simulator_facts
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
+from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.posteriors import central_interval
 from rfdropo_bayes.report.check_figures import rest_figure
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
-from rfdropo_bayes.robots.plausibility import implausible_values
+from rfdropo_bayes.robots.robot import implausible_values
 from rfdropo_bayes.simulators.body_engine import QUASI_STATIC
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_model
@@ -44,7 +44,7 @@ from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 from rfdropo_bayes.verbs.recording_doubts import asked_pulls, drives_beyond, recording_cautions, shortened
-from rfdropo_bayes.verbs.rest_answer import first_answer, rest_lines, rest_notes
+from rfdropo_bayes.verbs.rest_fit import first_answer, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
 LONG = 60.0  # recordings of more seconds make whoever checks them wait for minutes

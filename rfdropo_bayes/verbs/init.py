@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.counters import Column, Motion, quoted_key, read_on, turns_of, wraps_of
@@ -204,12 +205,12 @@ def write_first_files(
         seen: Frame | None = None,
         gain: float = 1.0,
     ) -> Experiment:
-        model = _model(made, outline, guess, first, seen, gain, rests=slow is not None)
+        model = _model(made, outline, guess, first, seen, gain, zero, rests=slow is not None)
         lines = [*_head(outline.name), *data, *_simulator(slow), *model, *group_lines(days)]
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
-    days = days_of(recordings)
+    days, zero = days_of(recordings), None
     if guess is None:
         write(_random_commands(outline))
         return robot, experiment
@@ -228,7 +229,10 @@ def write_first_files(
     if not runs:
         return robot, experiment
     first = runs[0]
-    usual = float(np.max(np.abs(np.vstack([first.initial_command, first.command]))))
+    if guess.reads_drives and guess.unwrap:  # the zero of a counter that wraps is anywhere in a turn
+        zero = first.command.mean(axis=0)
+    sent = np.vstack([first.initial_command, first.command])
+    usual = float(np.max(np.abs(sent if zero is None else sent - zero)))
     outline = replace(outline, usual_command=usual or None)
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
@@ -251,7 +255,7 @@ def write_first_files(
     seen = runs[0]
     bends = outline.sets_bend is not None
     scaled, stiff = ("length" in outline.assumed), ("young_modulus" in outline.assumed)
-    registration = register(spec_of(placed, folder), seen, scaled=scaled, bends=bends, stiff=stiff)
+    registration = register(spec_of(placed, folder), seen, scaled=scaled, bends=bends, stiff=stiff, zero=zero)
     ordered, order = guess, None
     if registration.arrangement is not None:
         turns = np.degrees(registration.arrangement.turns)
@@ -507,6 +511,7 @@ def _model(
     first: Trajectory | None,
     seen: Frame | None,
     gain: float,
+    zero: Float[np.ndarray, " channel"] | None,
     *,
     rests: bool,
 ) -> list[str]:
@@ -531,7 +536,7 @@ def _model(
         "",
         "[model.priors]          # inferred parameters; {} asks for the prior of the robot file or of the mechanism",
         *wanted,
-        *installed_priors(robot, first, seen, outline.assumed, gain),
+        *installed_priors(robot, first, seen, outline.assumed, gain, zero),
         "",
         "[inference]",
         'method = "laplace"      # rfdropo methods lists them',

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
+from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.mechanisms.sizes import scales_of
@@ -29,9 +30,11 @@ UNKNOWN = 0.5
 of drives, whose force per command no answer states."""
 
 
-def largest_pull(robot: Robot, recording: Trajectory) -> float:
-    """Largest displacement of a cable that the commands of a recording ask for [m], at nominal parameters."""
-    commands = np.vstack([recording.initial_command, recording.command])
+def largest_pull(robot: Robot, recording: Trajectory, zero: Float[np.ndarray, " channel"] | float = 0.0) -> float:
+    """Largest displacement of a cable that the commands of a recording ask for [m], at nominal parameters, from a zero
+    of the drives on.
+    """
+    commands = np.vstack([recording.initial_command, recording.command]) - zero
     return float(np.max(np.abs(commands @ np.asarray(robot.channel_matrix(robot.nominal())).T)))
 
 
@@ -67,6 +70,7 @@ def installed_priors(
     frame: Frame | None = None,
     assumed: Collection[str] = (),
     gain: float = 1.0,
+    zero: Float[np.ndarray, " channel"] | None = None,
 ) -> list[str]:
     """Lines of [model.priors] of a robot as it is installed.
 
@@ -76,6 +80,7 @@ def installed_priors(
         frame: frame in which a rod at rest explains that recording; priors are centred there.
         assumed: unknown sizes of the robot, which get wide priors.
         gain: force of drives that explains that recording, over the robot file's, if no answer states it.
+        zero: command at which the body is about straight, of drives whose zero is anywhere in a turn.
     """
     lines = []
 
@@ -83,8 +88,13 @@ def installed_priors(
         lines.append(f'{name} = {{ distribution = "Normal", loc = {loc:.3g}, scale = {scale:.2g} }}  # {words}')
 
     if robot.initial_displacement_names:
-        pull = scales_of(robot).pull if recording is None else largest_pull(robot, recording)
-        if pull > 0.0:
+        from_zero = 0.0 if zero is None else zero
+        pull = scales_of(robot).pull if recording is None else largest_pull(robot, recording, from_zero)
+        if pull > 0.0 and zero is not None:
+            wound = np.asarray(robot.channel_matrix(robot.nominal())) @ zero
+            for name, place in zip(robot.initial_displacement_names, wound, strict=True):
+                normal(name, ZERO * pull, "zero of the cable, from the mean of the commands", -place)
+        elif pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
     turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.remaining_turn, frame.shift)
     explained = "" if frame is None else f"; a rod at rest explains {100 * frame.explained:.3g} % of the motion there"

@@ -17,7 +17,7 @@ from rfdropo_bayes.model.assembly import (
     measured_parameters,
     physical_values,
 )
-from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
+from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.policies.episodes import Episodes, Settings
@@ -161,11 +161,8 @@ def randomisation_of(
     fixed = replace(spec, fixed={name: value for name, value in spec.fixed.items() if name not in absent})
     parts: list[Randomisation] = [Point(physical_values(fixed, simulator))]
     if isinstance(fit, Calibration):
-        fitted = fitted_integrator(fit.record.attrs, fit.folder)
-        check_fitted_integrator(fitted, simulator.integrator, where="fit")
         rows = drawn_rows(fit.record, simulator.parameters, robot=simulator.robot)
-        _check_parameters(fit.record, simulator, where="fit")
-        parts.append(_with_fixed(_in_its_session(rows, fit.record, simulator), fit.record, simulator))
+        parts.append(_of_record(rows, fit.record, fit.folder, simulator, where="fit"))
     elif fit is not None:
         parts.append(_of_run(Path(fit), simulator))
     elif table.randomisation != "none":
@@ -215,20 +212,31 @@ def _of_run(source: Path, simulator: AnySimulator, *, phi: bool = False) -> Rand
     """
     folder = source if source.is_dir() else source.parent
     file = source if source.is_file() and not phi else folder / POSTERIOR
-    randomisation: Randomisation
-    record: PosteriorRecord | None
-    if phi:
-        randomisation = read_phi(source, simulator.parameters, simulator.robot)
-        record = PosteriorRecord.load(file) if file.is_file() else None
-    else:
-        rows, record = read_posterior(source, simulator.parameters, simulator.robot), PosteriorRecord.load(file)
-        randomisation = _in_its_session(rows, record, simulator)
-    if record is not None:
-        _check_parameters(record, simulator, where=str(source))
+    own = (source, simulator.parameters, simulator.robot)
+    found: Randomisation = read_phi(*own) if phi else read_posterior(*own)
+    record = None if phi and not file.is_file() else PosteriorRecord.load(file)
+    return _of_record(found, record, folder, simulator, where=str(source))
+
+
+def _of_record(
+    found: Randomisation, record: PosteriorRecord | None, folder: Path | None, simulator: AnySimulator, *, where: str
+) -> Randomisation:
+    """A posterior or phi on the session that it describes, together with the fixed values of its fit; ``record`` is
+    None for phi without a posterior.
+
+    Raises:
+        InputError: a parameter that the simulator lacks, or another integrator than the simulator's.
+    """
     attributes = {} if record is None else record.attrs
-    fitted = fitted_integrator(attributes, folder)
-    check_fitted_integrator(fitted, simulator.integrator, where=str(source))
-    return _with_fixed(randomisation, record, simulator)
+    check_fitted_integrator(attributes, folder, simulator.integrator, where=where)
+    if record is None:
+        return found
+    _check_parameters(record, simulator, where=where)
+    if isinstance(found, Draws):
+        found = _in_its_session(found, record, simulator)
+    known = {spec.name for spec in simulator.parameters}
+    fixed = {info.name: value for info, value in record.fixed if info.name in known}
+    return Layers((Point(fixed), found), found.kind) if fixed else found
 
 
 def _check_parameters(record: PosteriorRecord, simulator: AnySimulator, *, where: str) -> None:
@@ -265,10 +273,3 @@ def _in_its_session(rows: Draws, record: PosteriorRecord, simulator: AnySimulato
     moved = replace(rows, rows=np.clip(rows.rows + shifts, low, high))
     spreads = {name: each.spread for name, each in own.items() if each.spread.any()}
     return Sessions(moved, spreads, {name: ends[name] for name in spreads}) if spreads else moved
-
-
-def _with_fixed(randomisation: Randomisation, record: PosteriorRecord | None, simulator: AnySimulator) -> Randomisation:
-    """A run's posterior, together with its fixed values of the simulator's parameters."""
-    known = {spec.name for spec in simulator.parameters}
-    fixed = {} if record is None else {info.name: value for info, value in record.fixed if info.name in known}
-    return Layers((Point(fixed), randomisation), randomisation.kind) if fixed else randomisation

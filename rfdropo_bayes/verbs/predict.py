@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import numpy as np
 import xarray as xr
-from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise import Autoregression
 from rfdropo_bayes.bayes.noise.autoregression import STATED
@@ -25,12 +24,12 @@ from rfdropo_bayes.data import (
     load_unseen,
     start_is_known,
 )
-from rfdropo_bayes.data.given_recordings import given_recording
 from rfdropo_bayes.data.sample_times import sample_time
+from rfdropo_bayes.data.unseen import given_recording
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, group_of, in_group
 from rfdropo_bayes.model.assembly import KNOWN, fixed_values, integrator_of, model_specs, with_groups
-from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator, fitted_integrator
+from rfdropo_bayes.model.fitted_integrator import check_fitted_integrator
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
@@ -84,7 +83,7 @@ def predict(
     """
     model = model_of(given_fit(fit, "predict"))
     record = fit.record
-    spec = model.spec
+    spec, path = model.spec, model.name if model.file is None else str(model.file.path)
     fitted_noise = record.attrs.get(NOISE, spec.noise)  # earlier posteriors lack it
     if spec.noise != fitted_noise:
         raise InputError(
@@ -105,7 +104,7 @@ def predict(
         data = model.settings.data
         if data is None:
             remedy = "name the format of the commands"
-            raise InputError("the experiment has no [data]", where=_path(model), remedy=remedy)
+            raise InputError("the experiment has no [data]", where=path, remedy=remedy)
         begun = record.attrs.get(BEGUN)
         unseen = load_unseen(data, model.folder, str(commands), start, begun=begun, episode=episode)
     else:
@@ -144,7 +143,7 @@ def predict(
     named = str(commands) if isinstance(commands, str | Path) else unseen.name
     facts = {
         "schema_version": SCHEMA_VERSION,
-        "experiment": _path(model),
+        "experiment": path,
         "posterior": None if fit.folder is None else str(fit.folder),
         "commands": named,
         "episode": episode,
@@ -160,10 +159,6 @@ def predict(
     with run_folder(Path(out), "predict", **settings, options=options, overwrite=overwrite) as folder:
         prediction.save(folder)
     return prediction
-
-
-def _path(model: Model) -> str:
-    return model.name if model.file is None else str(model.file.path)
 
 
 def _slow_error(
@@ -190,8 +185,8 @@ def model_of(fit: Calibration) -> Model:
         fit.
     """
     if fit.model is not None:
-        fitted = fitted_integrator(fit.record.attrs, fit.folder)
-        check_fitted_integrator(fitted, integrator_of(fit.model.spec), where=f"posterior of {fit.model.name}")
+        integrator, where = integrator_of(fit.model.spec), f"posterior of {fit.model.name}"
+        check_fitted_integrator(fit.record.attrs, fit.folder, integrator, where=where)
         return fit.model
     why = "no config.toml describes it"
     if fit.folder is not None and (fit.folder / CONFIG).is_file():
@@ -249,14 +244,12 @@ def summarise(predicted: RecordingPrediction) -> xr.Dataset:
     dataset["time"].attrs["units"] = "s"
     for name in data:
         dataset[name].attrs["units"] = "m"
-    return dataset if predicted.object_pose is None else dataset.assign(_object(predicted.object_pose))
-
-
-def _object(pose: Float[np.ndarray, "draw time 7"]) -> dict[str, xr.Variable]:
-    """Position of a pushed object: mean and quantiles of its centre, and every draw of its pose."""
-    variables = {OBJECT: xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})}
-    centre = pose[..., :3]
+    pose = predicted.object_pose
+    if pose is None:
+        return dataset
+    centre = pose[..., :3]  # of the pushed object: mean and quantiles, beside every draw of its pose
     quantiles = np.quantile(centre, list(LEVELS.values()), axis=0)
+    dataset[OBJECT] = xr.Variable(("draw", "time", "pose"), pose.astype(np.float32), {"units": POSE_UNITS})
     for name, value in (("mean", centre.mean(axis=0)), *zip(LEVELS, quantiles, strict=True)):
-        variables[f"{OBJECT}_{name}"] = xr.Variable(("time", "axis"), value, {"units": "m"})
-    return variables
+        dataset[f"{OBJECT}_{name}"] = xr.Variable(("time", "axis"), value, {"units": "m"})
+    return dataset

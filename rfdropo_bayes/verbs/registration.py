@@ -212,7 +212,15 @@ def _best(sights: Iterable[_Sight | None]) -> _Sight | None:
     return min((each for each in sights if each is not None), key=lambda each: each.unexplained, default=None)
 
 
-def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: bool, stiff: bool = False) -> Registration:
+def register(
+    spec: ModelSpec,
+    recording: Trajectory,
+    *,
+    scaled: bool,
+    bends: bool,
+    stiff: bool = False,
+    zero: Float[np.ndarray, " channel"] | None = None,
+) -> Registration:
     """Bring the robot of a model, at rest and at nominal values, to a recording.
 
     Args:
@@ -221,6 +229,7 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
         scaled: whether the body's length is not known, so that lengths may be scaled.
         bends: whether the bending per command is unknown.
         stiff: whether the stiffness is unknown.
+        zero: command at which the body is about straight; zero by default.
     """
     nothing = Registration(None)
     try:
@@ -232,6 +241,7 @@ def register(spec: ModelSpec, recording: Trajectory, *, scaled: bool, bends: boo
         return nothing
     robot = robot.showing(recording.marker_names)
     rows = rows_of([recording], recording.marker_names, best_delay([recording]))
+    rows = rows if zero is None else rows._replace(command=rows.command - zero)
     factors = BENDS if bends else (1.0,)
     sights = _Sights(robot, rows, scaled=scaled, bends=factors, stiff=stiff)
     start = as_written(len(own.channel_names), sections_of(own).number)

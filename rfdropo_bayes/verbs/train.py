@@ -24,8 +24,8 @@ from rfdropo_bayes.policies.training import train as learn
 from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.report import software_versions
-from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.report.run_files import CONFIG
+from rfdropo_bayes.report.summary import LEARNING
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import (
     EVALUATED_EPISODES,

@@ -7,13 +7,14 @@ import pandas as pd
 import pytest
 
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of, unwrapped
+from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of, unwrapped, wraps_of
 from rfdropo_bayes.errors import InputError
 
 TIME = 0.04 * np.arange(400)
 SMOOTH = np.column_stack([6000.0 * (1.0 - np.cos(0.9 * TIME)), 5000.0 * np.sin(0.7 * TIME)])
 LEVELS = np.repeat(np.random.default_rng(2).uniform(-500.0, 500.0, size=(80, 2)), 5, axis=0)
 STEPS = LEVELS[::5].cumsum(axis=0).repeat(5, axis=0)  # a command every fifth row
+WALK = 70.0 * np.random.default_rng(4).normal(size=(400, 2)).clip(-2.0, 2.0).cumsum(axis=0)  # steps up to 140 degrees
 SAWTOOTH = np.column_stack([(700.0 * TIME) % 4096.0, (300.0 * TIME) % 2000.0])
 
 
@@ -37,6 +38,7 @@ def notes(raw: np.ndarray, true: np.ndarray, unit: str = "counts") -> list[str]:
         (np.angle(np.exp(1e-3j * SMOOTH)), SMOOTH, "rad", "unwrap = {c1 = 6.283185307, c2 = 6.283185307}"),
         (np.round(SMOOTH * [1.0, 0.1]) % 4096.0, SMOOTH, "counts", "unwrap = {c1 = 4096, c2 = 4096}"),
         (np.column_stack([SMOOTH[:, 0] % 5000.0, SMOOTH[:, 1]]), SMOOTH, "counts", "unwrap = {c1 = 5000}"),
+        (WALK % 360.0, WALK, "deg", "unwrap = {c1 = 360, c2 = 360}"),
     ],
 )
 def test_a_counter_that_wraps_is_doubtful_and_the_line_mends_it(raw, true, unit, line):
@@ -62,6 +64,15 @@ def test_counters_that_start_elsewhere_after_a_restart_are_doubtful(true):
     moved = true.copy()
     moved[200:] += 9000.0
     assert notes(moved, moved) == []
+
+
+def test_counters_of_three_cables_of_which_two_determine_the_third_are_read_on():
+    true = np.column_stack([WALK, -WALK.sum(axis=1)])
+    motion = Motion(TIME, TIME, true @ np.random.default_rng(1).normal(size=(3, 3)))
+    columns = [Column(f"c{k}", own, [360.0]) for k, own in enumerate((0.5 * true % 360.0).T)]
+    assert {name: each.turn for name, each in wraps_of(columns, motion).items()} == dict.fromkeys(
+        ("c0", "c1", "c2"), 360.0
+    )
 
 
 def test_values_are_read_on_and_missing_ones_stay_missing():

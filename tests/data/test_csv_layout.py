@@ -80,6 +80,10 @@ def test_a_row_of_values_or_words_is_no_line_of_units(row):
     assert units_above([row, "0.5,2.0,100,1,2"], ",") is None
 
 
+def test_names_of_several_words_stand_between_tabs():
+    assert dialect_of(["step\tload 1\ttip x", "0\t0.5\t6.44", "1\t0.7\t6.5"]).separator == "\t"
+
+
 def test_decimal_commas_that_come_late_are_seen():
     assert dialect_of(["a;b", *["1;2"] * 100, "1,5;2"]) == (";", ",")
 

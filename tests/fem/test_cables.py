@@ -11,11 +11,10 @@ import pytest
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.cable_problem import settle_cables
 from rfdropo_bayes.fem.cables import courses, lengths, rest_lengths, routes, station_rows, threads
 from rfdropo_bayes.fem.components import rotation, turned
 from rfdropo_bayes.fem.constraints import CABLE_SOFTNESS, solve_constraints
-from rfdropo_bayes.fem.stage_solve import laned
+from rfdropo_bayes.fem.stage_solve import laned, settle_cables
 
 solve_tensions = jax.jit(lambda compliance, slack, start: solve_constraints(compliance, slack, start, 1.0))
 

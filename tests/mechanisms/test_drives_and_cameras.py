@@ -12,6 +12,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY, mechanisms_named
+from rfdropo_bayes.mechanisms.actuation import CableDelay
 from rfdropo_bayes.mechanisms.registry import choose_mechanisms
 from rfdropo_bayes.model.assembly import build_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
@@ -299,3 +300,17 @@ def test_a_class_of_the_library_is_named_as_in_a_file():
         assert choice.source == name
         (again,) = choose_mechanisms([choice.source])
         assert again.kind is kind
+
+
+def test_each_command_may_have_a_delay_of_its_own():
+    """In a recording and step by step."""
+    delays = (0.034, 0.0)
+    each = CableDelay(("a", "b"))
+    values = {f"cable_delay_{name}": jnp.asarray(delay) for name, delay in zip("ab", delays, strict=True)}
+    step, history = np.arange(len(COMMAND) + 1), np.vstack([START, COMMAND])
+    late = [np.interp(step[1:] - d / STEP, step, own) for d, own in zip(delays, history.T, strict=True)]
+    expected = np.stack(late, axis=1)
+    np.testing.assert_allclose(each.actuate(values, COMMAND, START, STEP), expected, atol=1e-15)
+    begun = each.begin(values, START, STEP)
+    reached = jax.lax.scan(lambda memory, given: each.advance(values, memory, given, STEP), begun, COMMAND)[1]
+    np.testing.assert_allclose(reached, expected, atol=1e-15)

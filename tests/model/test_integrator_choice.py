@@ -13,10 +13,10 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import build_robot_simulator, integrator_of
 from rfdropo_bayes.model.experiment import SimulatorTable
 from rfdropo_bayes.model.experiment_file import describe, read_tables
-from rfdropo_bayes.model.fitted_integrator import INTEGRATOR, check_fitted_integrator, fitted_integrator
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR, check_fitted_integrator
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import CONFIG, run_folder
-from rfdropo_bayes.policies.building import trunk_simulator
+from rfdropo_bayes.policies.episodes import trunk_simulator
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
@@ -71,11 +71,12 @@ def test_a_run_states_its_integrator(tmp_path):
 
 
 def test_an_answer_is_used_with_the_integrator_of_its_fit(tmp_path):
-    assert fitted_integrator({INTEGRATOR: "sdirk2"}) == "sdirk2"
-    assert fitted_integrator({}) is None
+    check_fitted_integrator({INTEGRATOR: "euler"}, None, None, where="a black box")
+    check_fitted_integrator({}, tmp_path, "euler", where="a fit that states none")
     written(tmp_path / CONFIG, EXPERIMENT + 'integrator = "sdirk2"\n')
-    assert fitted_integrator({}, tmp_path) == "sdirk2"
-    check_fitted_integrator("euler", None, where="a black box")
+    check_fitted_integrator({}, tmp_path, "sdirk2", where="a run")
+    with pytest.raises(InputError, match="fitted with integrator 'sdirk2'"):
+        check_fitted_integrator({}, tmp_path, "euler", where="a run")
     early, late = (
         Calibration(posterior(**given), {}, "", rb.Model("smooth_arm"))
         for given in ({INTEGRATOR: "euler"}, {INTEGRATOR: "sdirk2"})

@@ -14,8 +14,8 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.policies.building import make_episodes
-from rfdropo_bayes.policies.gym_env import TrunkEnv, TrunkVectorEnv
+from rfdropo_bayes.policies.episodes import make_episodes
+from rfdropo_bayes.policies.gym_env import TrunkEnv
 from rfdropo_bayes.policies.randomisation import (
     Draws,
     Layers,
@@ -134,16 +134,6 @@ def test_gymnasium_makes_the_tasks_by_name() -> None:
     seen, info = env.reset(seed=3, options={"goal": [0.0, -0.02, 0.13]})
     assert info["goal"] == [0.0, -0.02, 0.13]
     assert seen.shape == (66,)
-    vector = gymnasium.make_vec(REACH, num_envs=2)
-    assert isinstance(vector.unwrapped, TrunkVectorEnv)
-    seen, begun = vector.reset(seed=1)
-    assert seen.shape == (2, 66)
-    for _ in range(100):
-        seen, _, _, truncated, info = vector.step(np.zeros(2, dtype=int))
-    assert truncated.all()
-    assert np.array_equal(info["final_info"]["goal"], begun["goal"])
-    assert not np.array_equal(info["goal"], begun["goal"])  # that of the episode that has begun
-    assert np.array_equal(seen[:, 63:66], info["goal"].astype(np.float32))
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 import rfdropo_bayes as rb
 from rfdropo_bayes.model.assembly import integrator_of
 from rfdropo_bayes.model.experiment import Experiment
-from rfdropo_bayes.model.fitted_integrator import INTEGRATOR, fitted_integrator, stated_integrator
+from rfdropo_bayes.model.fitted_integrator import INTEGRATOR, stated_integrator
 from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.tables import parse_table
 
@@ -37,7 +37,7 @@ def test_the_tables_of_a_model_say_how_it_takes_time_steps(simulator):
     again = spec_of(parse_table(Experiment, model.tables(), where="tables"), Path(), model.robot)
     assert integrator_of(again) == integrator_of(model.spec) in simulator.values()
     assert again.simulator.time_step == model.spec.simulator.time_step
-    assert fitted_integrator(stated_integrator(model.spec)) == integrator_of(model.spec)  # in the record of a fit
+    assert stated_integrator(model.spec) == {INTEGRATOR: integrator_of(model.spec)}  # in the record of a fit
 
 
 @pytest.mark.slow

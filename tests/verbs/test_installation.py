@@ -67,6 +67,14 @@ def test_zeros_without_a_recording_are_lengths_of_cable_whatever_the_unit_of_com
     assert in_angles["initial_displacement"] == pytest.approx(in_metres["initial_displacement"], rel=0.05)
 
 
+def test_zeros_of_drives_that_count_from_anywhere_are_centred_at_the_mean_of_the_commands():
+    robot, zero = arm(), np.array([3.0, -1.0, 0.5, 2.0])[: len(arm().channel_names)]
+    lines = installed_priors(robot, run("rad", 2.0), zero=zero)
+    wound = np.asarray(robot.channel_matrix(robot.nominal())) @ zero
+    for name, place in zip(robot.initial_displacement_names, wound, strict=True):
+        assert any(line.startswith(f"{name} = ") and f"loc = {-place:.3g}," in line for line in lines)
+
+
 def test_commands_that_never_move_leave_zeros_fixed():
     assert "initial_displacement" not in priors_of(installed_priors(arm(), run("rad", 0.0)))
 

@@ -6,6 +6,8 @@ Model errors of a push are correlated in time, since a body at rest keeps its po
 process (`bayes.noise`) with its own sizes and its own correlation time. If the noise of the positions is white, this
 noise is also white, and `inference.modes.lasting` weights the rows: noise that lasts for the whole recording would also
 absorb a wrong push.
+
+Rotations as unit quaternions (x, y, z, w).
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Rows of fields in SIMD lanes: cleared, read at points, and filled from a batch."""
+"""Rows of fields in SIMD lanes: cleared, read at points, and filled from a batch.
+
+Blocks of lanes spread over threads.
+"""
 
 from __future__ import annotations
 

@@ -9,6 +9,20 @@ then resampled, and the effective number ``(sum w)^2 / sum w^2`` measures the nu
 
 If the first candidates have nearly equal weights, the normals describe the posterior: the draws are then unweighted,
 and no further rollouts are needed.
+
+Several optima: selection of the optima that explain the data about equally well, and their weights in a posterior.
+
+Densities alone do not decide this. Errors of a simulator are correlated between rows. Under white noise, optima that
+explain the data equally well then differ by hundreds of nats. Optima are therefore compared by sums over rows of
+differences of log densities, with standard errors that include the autocorrelation (Vehtari, Gelman & Gabry 2017, for
+series).
+
+Standard deviations of groups of coordinates, integrated out of a normal approximation instead of optimised.
+
+A hierarchy cannot be approximated at its joint mode, at which a standard deviation is zero or at the end of its prior.
+Given the standard deviations, the group parameters are as normal as the others. The optimisation therefore fixes the
+standard deviations. Their posterior follows from the likelihood's quadratic form at the mode, which does not depend on
+them (nested Laplace approximation, Rue, Martino & Chopin 2009).
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 Numbers are written in full. If elements of the text and of the model do not correspond (replicas, composites, URDF),
 MuJoCo's own text of the model is used, whose other numbers have six digits.
+
+First table of an experiment with a MuJoCo model: elements of markers, commands and parameters.
 """
 
 from __future__ import annotations

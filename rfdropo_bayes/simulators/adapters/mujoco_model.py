@@ -3,6 +3,8 @@
 A rollout takes the unchanged model, sets the parameters of its lane (`mujoco_elements`), lets MuJoCo recompute derived
 constants (`mj_setConst`), and plays the commands as ``ctrl``, each in force over the step that ends with its row. All
 lanes run at once in `mujoco.rollout`, on all processors.
+
+Lanes of a MuJoCo model that continue from their state, each with its own parameters.
 """
 
 from __future__ import annotations
