@@ -84,7 +84,7 @@ def test_a_prediction_holds_every_draw_of_the_cube_in_the_measuring_frame(simula
     ]
     draws = {"offset_x": rng.normal(0, 0.005, (1, 8)), "observation_noise": np.full((1, 8), 1e-3)}
     PosteriorRecord(tuple(infos), draws, attrs={"integrator": "sdirk2"}).save(tmp_path / "posterior.nc")
-    changes = ["simulator.push=true", "simulator.time_step=0.02", "data.format='netcdf'"]
+    changes = ["simulator.push=true", "simulator.integrator='sdirk2'", "data.format='netcdf'"]
     model = rb.Model.read(EXPERIMENTS / "sim2real_trunk.toml", changes)
     rb.predict(rb.Calibration.of_posterior(tmp_path, model), tmp_path / "commands.nc", out=tmp_path / "out")
     with xr.open_dataset(tmp_path / "out" / "prediction.nc") as opened:
