@@ -48,7 +48,6 @@ class Status(IntEnum):
     """Bits of the statusword (object 0x6041) beyond the state."""
 
     VOLTAGE_ENABLED = 1 << 4
-    WARNING = 1 << 7
     REMOTE = 1 << 9
     LIMIT_ACTIVE = 1 << 11
     FOLLOWS_COMMAND = 1 << 12

@@ -152,5 +152,4 @@ class EmergencyCode(IntEnum):
     SYNC_LOST = 0x8100
     HEARTBEAT_LOST = 0x8130
     PDO_SHORT = 0x8210
-    PDO_TIMEOUT = 0x8250
     FOLLOWING_ERROR = 0x8611

@@ -39,7 +39,6 @@ class FirRegression:
     scale: Float[np.ndarray, " feature"]
     offset: Float[np.ndarray, "marker 3"]  # mean pose
     weights: Float[np.ndarray, "marker feature 3"]  # weights of the standardised features
-    penalty: float  # ridge penalty per row
     error: float  # cross-validated root mean square distance, all markers [m]
 
     def predict(self, recording: Trajectory) -> Float[np.ndarray, "time marker 3"]:
@@ -316,7 +315,6 @@ def _train(
         scale,
         offset,
         weights,
-        float(PENALTIES[best]),
         float(np.sqrt(squares[best] / total)) if total else np.inf,
     )
 

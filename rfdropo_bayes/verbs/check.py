@@ -44,7 +44,7 @@ from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 from rfdropo_bayes.verbs.recording_doubts import asked_pulls, drives_beyond, recording_cautions, shortened
-from rfdropo_bayes.verbs.rest_answer import first_answer, rest_lines, rest_notes
+from rfdropo_bayes.verbs.rest_fit import first_answer, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
 LONG = 60.0  # recordings of more seconds make whoever checks them wait for minutes

@@ -12,8 +12,16 @@ from rfdropo_bayes.model.model_spec import ModelSpec, SimulatorTable
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import as_written
 from rfdropo_bayes.verbs.at_rest import blocks_of, resting
-from rfdropo_bayes.verbs.rest_answer import estimate_words, first_answer, rest_lines, rest_notes
-from rfdropo_bayes.verbs.rest_fit import OWN, Estimate, RestFit, least_squares
+from rfdropo_bayes.verbs.rest_fit import (
+    OWN,
+    Estimate,
+    RestFit,
+    estimate_words,
+    first_answer,
+    least_squares,
+    rest_lines,
+    rest_notes,
+)
 
 
 def test_least_squares_weigh_measurements_against_priors():
