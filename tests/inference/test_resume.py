@@ -27,7 +27,11 @@ OPTIONS = {
     "laplace": {"starts": 2, "blocks": 2, "draws": 50},
     "rfdropo": {"evaluations": 60, "rollouts_per_candidate": 10},
 }
-CASES = [*OPTIONS.items(), ("laplace", {"starts": 4, "pilot_particles": 50, "rollouts": 2000.0, "draws": 50})]
+CASES = [
+    *OPTIONS.items(),
+    ("laplace", {"starts": 4, "pilot_particles": 50, "rollouts": 2000.0, "draws": 50}),
+    ("rfdropo", {**OPTIONS["rfdropo"], "optimiser": "cem"}),
+]
 
 
 class Killed(Exception):

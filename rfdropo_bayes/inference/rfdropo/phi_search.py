@@ -138,7 +138,10 @@ class CandidateRollouts(NamedTuple):
     alive: Bool[np.ndarray, "c m"]
 
 
-STEP = 0.3  # initial step of the optimiser, as a share of the search range
+OPTIMISERS = ("cma", "cem")
+STEP = 0.3  # initial step of an optimiser, as a share of the search range
+ELITE = 0.3  # share of the candidates that a refit by cross-entropy uses
+SMOOTHING = 0.7  # weight of the new fit; the old fit keeps the rest, which prevents collapse of the spread
 LEVELS = 8  # rollouts are simulated to one of this many horizons, the shortest sufficient horizon
 # Added to the variances, in squared units of the trajectory's root mean square motion; unless the published pipeline is
 # asked for, the observation noise at the prior's medians is also added.
@@ -156,6 +159,7 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
         rollouts: budget in full-length rollouts, which then decides the number of generations.
         evaluations: number of candidates if there is no budget (paper: 5000).
         rollouts_per_candidate: Monte-Carlo rollouts behind each loss (paper: 100).
+        optimiser: "cma" or "cem".
         parameters: names of the searched parameters; empty for all that rollouts depend on.
         search: ranges that differ from the central 99 % of the prior, by name.
         draws: number of draws of the final distribution.
@@ -166,6 +170,7 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
     rollouts: float | None = None
     evaluations: int = 5000
     rollouts_per_candidate: int = 100
+    optimiser: str = "cma"
     parameters: tuple[str, ...] = ()
     search: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     draws: int = 2000
@@ -173,6 +178,8 @@ class RfdropoConfig(MethodOptions, called="RFDROPO"):
 
     def __post_init__(self) -> None:
         where = "[inference]"
+        if self.optimiser not in OPTIMISERS:
+            raise InputError(f"unknown optimiser {self.optimiser!r}", where=where, remedy=f"use one of {OPTIMISERS}")
         least = {"evaluations": 1, "rollouts_per_candidate": 4, "draws": 1}
         for name, lowest in least.items():
             if getattr(self, name) < lowest:
@@ -199,7 +206,7 @@ def make_plan(problem: RolloutProblem, config: RfdropoConfig, key: PRNGKeyArray)
     prior = {name: np.asarray(values) for name, values in problem.sample_prior(key, 1000).items()}
     names = config.parameters or problem.physical_names
     space = search_space(problem, names, config.search, prior)
-    population = 4 + math.floor(3.0 * math.log(space.dimension))  # Hansen's default for CMA-ES
+    population = default_population(config.optimiser, space.dimension)
     fixed = {name: float(np.median(prior[name])) for name in problem.names if name not in names}
     scale = motion_scale(np.asarray(problem.observed, dtype=float), np.asarray(problem.observed_mask))
     finalists = FINALISTS if config.mended else 0
@@ -331,7 +338,7 @@ def _search(
     """All generations; a resumed optimiser is given its history again."""
     k = plan.space.dimension
     seed = int(host_generator(key).integers(2**31))
-    optimiser = CovarianceAdaptation(k, high=WIDTH, sigma=STEP * WIDTH, population=plan.population, seed=seed)
+    optimiser = make_optimiser(config.optimiser, k, high=WIDTH, sigma=STEP, population=plan.population, seed=seed)
     saved = checkpoint.load()
     nothing = np.empty((0, plan.population, k)), np.empty((0, plan.population))
     empty = SearchState(*nothing, Ledger(), [], 0.0)
@@ -393,17 +400,67 @@ def paper_horizon(iteration: int, iterations: int, n_rows: int, *, mended: bool 
     return min(n_rows, max(1, math.floor(n_rows * share + 1e-9)))
 
 
-class CovarianceAdaptation:
-    """CMA-ES of pycma over the box ``[0, high]^d``, from its middle, with random numbers of its own instead of numpy's
-    global generator: `ask` for the candidates of a generation, `tell` their losses (infinite losses rank last).
+def default_population(name: str, d: int) -> int:
+    """``4 + floor(3 ln d)``, Hansen's default for CMA-ES; the cross-entropy method wants 5 d, it keeps little."""
+    hansen = 4 + math.floor(3.0 * math.log(d))
+    return max(hansen, 5 * d) if name == "cem" else hansen
+
+
+def make_optimiser(name: str, d: int, *, high: float, sigma: float, population: int, seed: int) -> Optimiser:
+    """An optimiser over ``[0, high]^d`` that starts in the middle.
 
     Args:
+        name: "cma" or "cem".
         d: dimension.
         high: upper edge of the box.
-        sigma: initial step.
+        sigma: initial step, as a share of the box.
         population: candidates per generation.
         seed: seed of its random numbers.
+
+    Raises:
+        InputError: an unknown name.
     """
+    if name == "cma":
+        return CovarianceAdaptation(d, high, sigma * high, population, seed)
+    if name == "cem":
+        return CrossEntropy(d, high, sigma * high, population, seed)
+    raise InputError(f"unknown optimiser {name!r}", where="[inference]", remedy=f"use one of {', '.join(OPTIMISERS)}")
+
+
+class CrossEntropy:
+    """Cross-entropy method: refit a diagonal normal to the best candidates of each generation.
+
+    Args:
+        d, high, sigma, population, seed: see `make_optimiser`, sigma in the box's units.
+    """
+
+    def __init__(self, d: int, high: float, sigma: float, population: int, seed: int) -> None:
+        self.high, self.population = high, population
+        self.elites = max(2, round(ELITE * population))
+        self.mean, self.sd = np.full(d, 0.5 * high), np.full(d, sigma)
+        self._generator = np.random.default_rng(seed)
+
+    def ask(self) -> Float[np.ndarray, "population d"]:
+        """Normal candidates; values outside are reflected, so that mass does not collect at the edges."""
+        z = self._generator.standard_normal((self.population, len(self.mean)))
+        folded = np.mod(self.mean + self.sd * z, 2.0 * self.high)
+        return np.minimum(folded, 2.0 * self.high - folded)
+
+    def tell(self, candidates: Float[np.ndarray, "population d"], losses: Float[np.ndarray, " population"]) -> None:
+        """Refit to the elite. Deviations are taken from the OLD mean, so that the width does not collapse early."""
+        best = candidates[np.argsort(losses, kind="stable")[: self.elites]]
+        deviation = np.sqrt(np.mean((best - self.mean) ** 2, axis=0))
+        self.mean = SMOOTHING * best.mean(axis=0) + (1.0 - SMOOTHING) * self.mean
+        self.sd = SMOOTHING * deviation + (1.0 - SMOOTHING) * self.sd
+
+    @property
+    def centre(self) -> Float[np.ndarray, " d"]:
+        """Mean of the normal."""
+        return self.mean
+
+
+class CovarianceAdaptation:
+    """CMA-ES of pycma, with random numbers of its own instead of numpy's global generator."""
 
     def __init__(self, d: int, high: float, sigma: float, population: int, seed: int) -> None:
         with warnings.catch_warnings():
@@ -436,6 +493,12 @@ class CovarianceAdaptation:
     def centre(self) -> Float[np.ndarray, " d"]:
         """Mean of the search distribution, inside the box."""
         return np.asarray(self._strategy.result.xfavorite)
+
+
+Optimiser = CrossEntropy | CovarianceAdaptation
+"""Minimises a noisy loss over a box: `ask` for the candidates of a generation, `tell` their losses (infinite losses
+rank last), and `centre` of the search distribution.
+"""
 
 
 def uniforms(key: PRNGKeyArray, m: int, d: int, *, stratified: bool) -> Float[np.ndarray, "m d"]:

@@ -1,4 +1,4 @@
-"""RF-DROPO: the match, the distribution, the optimiser, and what was mended."""
+"""RF-DROPO: the match, the distribution, the optimisers, and what was mended."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from scipy.stats import multivariate_normal
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.rfdropo import phi_search as rfdropo
 from rfdropo_bayes.inference.rfdropo.phi_search import (
-    CovarianceAdaptation,
     RfdropoConfig,
+    default_population,
+    make_optimiser,
     motion_scale,
     search_space,
     step_log_likelihood,
@@ -44,11 +45,12 @@ def test_motion_is_measured_from_where_each_feature_was_first_seen():
     assert motion_scale(np.ones((3, 2)), np.ones((3, 2), dtype=bool)) == 1.0
 
 
-def test_the_optimiser_finds_a_quadratic_inside_its_box_and_repeats_itself():
+@pytest.mark.parametrize("name", ["cma", "cem"])
+def test_optimisers_find_a_quadratic_inside_its_box_and_repeat_themselves(name):
     target = np.array([0.5, 3.7, 2.0, 1.2])
 
     def search(seed):
-        optimiser = CovarianceAdaptation(4, high=4.0, sigma=1.2, population=20, seed=seed)
+        optimiser = make_optimiser(name, 4, high=4.0, sigma=0.3, population=20, seed=seed)
         for _ in range(60):
             candidates = optimiser.ask()
             assert candidates.min() >= 0.0
@@ -64,6 +66,10 @@ def test_the_optimiser_finds_a_quadratic_inside_its_box_and_repeats_itself():
     np.testing.assert_allclose(first, target, atol=0.05)
     np.testing.assert_array_equal(search(3), first)
     assert not np.array_equal(search(4), first)
+
+
+def test_the_default_population_is_hansens():
+    assert [default_population("cma", d) for d in (2, 6, 10)] == [6, 9, 10]
 
 
 def test_draws_are_truncated_normals_inside_the_hard_bounds():
@@ -88,10 +94,11 @@ def test_draws_are_truncated_normals_inside_the_hard_bounds():
     assert not any("mean of frequency" in caution.sentence for caution in found)
 
 
-def test_a_known_distribution_is_recovered():
+@pytest.mark.parametrize("optimiser", ["cma", "cem"])
+def test_a_known_distribution_is_recovered(optimiser):
     """Eight trajectories' worth of features drawn from a known phi cannot be had from one; one gives the mean."""
     problem = Spring()
-    config = RfdropoConfig(rollouts=20000.0, rollouts_per_candidate=20)
+    config = RfdropoConfig(rollouts=20000.0, rollouts_per_candidate=20, optimiser=optimiser)
     result = rfdropo.run(problem, config, KEY)
     assert result.phi["frequency"]["mean"] == pytest.approx(2.3, abs=0.03)
     assert result.phi["damping"]["mean"] == pytest.approx(0.4, abs=0.05)
@@ -160,10 +167,11 @@ class Deceptive(Spring):
         self.observed = np.where(np.arange(self.n_rows)[:, None] < 2, wrong, true + noise)
 
 
-def test_finalists_are_scored_again_at_the_full_horizon(monkeypatch):
+@pytest.mark.parametrize("optimiser", ["cma", "cem"])
+def test_finalists_are_scored_again_at_the_full_horizon(optimiser, monkeypatch):
     """The lowest loss ever belongs to a short horizon and to the wrong frequency; as published it is returned."""
     monkeypatch.setattr(rfdropo, "FLOOR", 1e-3)
-    settings = {"rollouts": 20000.0, "rollouts_per_candidate": 20}
+    settings = {"rollouts": 20000.0, "rollouts_per_candidate": 20, "optimiser": optimiser}
     published = rfdropo.run(Deceptive(), RfdropoConfig(**settings, mended=False), KEY)
     mended = rfdropo.run(Deceptive(), RfdropoConfig(**settings), KEY)
     for result in (published, mended):
