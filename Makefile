@@ -98,8 +98,9 @@ site: $(SITE) ## the documentation as pages, in site/; needs no network
 gallery: $(DEV) ## run the examples, and draw docs/gallery.md of them (minutes)
 	$(BIN)/python tools/gallery.py
 
-reference: $(CORE) ## write docs/reference from the code
+reference: $(DEV) ## write docs/reference from the code, and docs/measured.md from the ledgers
 	$(BIN)/python tools/reference.py
+	$(BIN)/python tools/measured.py
 
 notebook-outputs: $(DEV) ## run every notebook and keep its outputs in it
 	cd notebooks && PYTHONWARNINGS='ignore:IProgress not found' ../$(BIN)/jupyter-execute --inplace --timeout=1800 *.ipynb

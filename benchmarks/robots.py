@@ -33,7 +33,7 @@ RUNS = {
     "deepc_next_day": "adapt RUNS/deepc_arm --recording $RFDROPO_DATA/deepc_arm/arduino_log_2025-08-28_16-44-24.txt "
     "--seconds 60 " + " ".join(f"--set model.per_group.{change}" for change in ZEROS_AND_CAMERA.split()),
     "deepc_audit": "audit experiments/deepc_arm.toml --from RUNS/deepc_arm",
-    "crl_tdcr": "calibrate experiments/crl_tdcr.toml",
+    "crl_tdcr": "calibrate experiments/crl_tdcr.toml --set inference.minutes=20",
     "three_cable_static": "calibrate experiments/three_cable_static.toml --set inference.minutes=20",
 }
 """Commands by name, the cheap ones first; RUNS is the folder of the runs before."""

@@ -13,17 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from scipy.stats import binomtest
 
 from rfdropo_bayes.files import read_lines
-from studies.table2 import share_of
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 REPORTS = REPOSITORY / "reports"
 PAGE = REPOSITORY / "docs" / "measured.md"
-REACHED = 15.25  # mm: how near an episode of the paper's tasks has to end
 
 
 def counted(found: int, of: int) -> dict[str, Any]:
@@ -47,7 +44,7 @@ def days() -> dict[str, dict[float, Mapping[str, Any]]]:
     and largest error [mm] of the recordings that were not shown.
     """
     found: dict[str, dict[float, Mapping[str, Any]]] = {}
-    for line in read_lines(REPORTS / "leave_out" / "rod.jsonl"):
+    for line in read_lines(REPORTS / "leave_out" / "ledger.jsonl"):
         rows = list(line["recordings"].values())
         rows = rows[1:] if line["seconds"] and len(rows) > 1 else rows
         ends = {
@@ -59,9 +56,9 @@ def days() -> dict[str, dict[float, Mapping[str, Any]]]:
     return found
 
 
-def audits(*ledgers: str) -> dict[str, Mapping[str, Any]]:
+def audits(ledger: str) -> dict[str, Mapping[str, Any]]:
     """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``)."""
-    lines = [line for ledger in ledgers for line in read_lines(REPORTS / ledger)]
+    lines = read_lines(REPORTS / ledger)
     right: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
         "null": lambda result: result["verdict"] == "no_discrepancy",
         "removed": lambda result: result["verdict"] not in ("explained", "equivalent"),
@@ -80,7 +77,7 @@ def audits(*ledgers: str) -> dict[str, Mapping[str, Any]]:
 
 def sizes() -> Mapping[str, Any]:
     """Share of 90 % intervals that hold the size, given the right cause."""
-    learnt = [size for line in read_lines(REPORTS / "size_coverage" / "rod.jsonl") for size in line["sizes"]]
+    learnt = [size for line in read_lines(REPORTS / "size_coverage" / "rod.jsonl") for size in line.get("sizes", [])]
     return counted(sum(abs(size["deviations"]) <= 1.645 for size in learnt), len(learnt))
 
 
@@ -90,17 +87,14 @@ def table1(folder: str) -> dict[str, Mapping[str, Any]]:
     return {f"{cell['task']} {cell['row']}": cell for cell in content["cells"] if cell["truths"] == "off-centre"}
 
 
-def policies(folder: str, within: float = REACHED) -> dict[str, str]:
-    """Share of episodes that end within a distance [mm] by row, of all its trainings, with a 95 % interval."""
-    episodes: dict[str, list[np.ndarray]] = {}
-    for file in sorted((REPORTS / folder / "evaluations").glob("*/episodes.csv")):
-        hits = 1e3 * pd.read_csv(file)["distance"].to_numpy() <= within
-        episodes.setdefault(file.parent.name.rsplit("_", 1)[0], []).append(hits)
-    shares = {row: share_of(np.array(hits)) for row, hits in episodes.items()}
-    return {
-        row: f"{100 * share['share']:.0f} % [{100 * share['low']:.0f}, {100 * share['high']:.0f}]"
-        for row, share in shares.items()
-    }
+def policies(target: str, within: str = "15.25 mm") -> dict[str, str]:
+    """Share of episodes that end within a distance by row, with its 95 % interval, from the table of a target of
+    `benchmarks/fresh_targets.py`.
+    """
+    text = (REPORTS / "fresh_targets" / target / "table.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
+    column = rows[0].index(within)
+    return {row[0]: row[column] for row in rows[1:]}
 
 
 def sbc() -> dict[str, float]:
@@ -132,11 +126,12 @@ def page() -> str:
     return words.get_template("measured.md.j2").render(
         robots=robots(),
         days=days(),
-        rest=audits("audit_rest/datasets.jsonl", "audit_rest/seeds_1000_1012.jsonl"),
+        rest=audits("audit_rest/seeds_1000_1012.jsonl"),
         motion=audits("audit_power/rod/datasets.jsonl"),
         sizes=sizes(),
         reach=table1(""),
         push=table1("push_20"),
+        trunk=json.loads((REPORTS / "sim2real_trunk" / "summary.json").read_text(encoding="utf-8")),
         policies=policies,
         sbc=sbc(),
         sofa=sofa(),
