@@ -14,6 +14,7 @@ from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.posteriors import central_interval
+from studies import rivals  # noqa: F401 - it adds its methods to the table of the package
 from studies.replicas import simulated_data, with_measured
 from studies.virtual_tasks import TASKS, InferenceTask, draw_truth, excited, task_problem
 

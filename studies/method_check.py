@@ -15,10 +15,12 @@ from rfdropo_bayes.files import write_json
 from rfdropo_bayes.inference.methods import make_config
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.model.run_folder import LOG, hashes, run_folder
+from rfdropo_bayes.model.run_folder import COMMANDS, LOG, RunKind, hashes, run_folder
 from rfdropo_bayes.verbs.calibrate import inference_options
-from studies import sbc
+from studies import rivals, sbc  # noqa: F401 - rivals adds its methods to the table of the package
 from studies.replicas import simulated_data, with_measured
+
+COMMANDS["sbc"] = RunKind(("sbc.json", "sbc.jsonl"), resumable=True)
 
 MOST_FAILURES = 100
 

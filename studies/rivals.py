@@ -28,6 +28,7 @@ from rfdropo_bayes.bayes.problem import Problem, RolloutProblem, with_rollouts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior
 from rfdropo_bayes.inference.method_options import MethodOptions
+from rfdropo_bayes.inference.methods import METHODS, Method
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook
 from rfdropo_bayes.inference.result import InferenceResult, chains, exclusion_cautions, prior_cautions
 from rfdropo_bayes.inference.smc.moves import host_generator
@@ -358,3 +359,8 @@ def informative(
     kept = spread > 1e-9 * max(float(spread.max()), 1e-300)
     mean, spread = summaries.mean(axis=0)[kept], spread[kept]
     return (summaries[:, kept] - mean) / spread, (observed[kept] - mean) / spread, kept
+
+
+METHODS["bayessim"] = Method(BayesSimConfig, run_bayessim)
+METHODS["npdr"] = Method(NpdrConfig, run_npdr)
+METHODS["udr"] = Method(UdrConfig, run_udr, posterior=False)

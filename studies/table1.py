@@ -16,12 +16,14 @@ from rfdropo_bayes.cautions import grave, read_cautions
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
-from rfdropo_bayes.model.run_folder import LOG, run_folder
+from rfdropo_bayes.model.run_folder import COMMANDS, LOG, RunKind, run_folder
 from rfdropo_bayes.report.summary import software_versions
 from studies.comparison import RIVALS, ROWS, fit, misleads
 from studies.fits import finished, run_fits
 from studies.rivals import import_sbi
 from studies.virtual_tasks import TASKS
+
+COMMANDS["table1"] = RunKind(("table1.json", "table1.md", "table1.png", "fits.jsonl"), resumable=True, shared=True)
 
 PAPER = {  # mean squared error and its deviation, Table I
     "TrunkReach": {"BayesSim": (16.60, 0.30), "NPDR": (8.38, 3.22), "RF-DROPO": (1.70, 1.93)},

@@ -29,7 +29,7 @@ from rfdropo_bayes.files import output_folder, write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.experiment_file import describe, read_tables, self_contained
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.model.run_folder import CHECKPOINTS, LOG, RUN, run_ended, run_folder
+from rfdropo_bayes.model.run_folder import CHECKPOINTS, COMMANDS, LOG, RUN, RunKind, run_ended, run_folder
 from rfdropo_bayes.report import software_versions
 from rfdropo_bayes.report.style import CYCLE, WIDTH, styled
 from rfdropo_bayes.results.audited import AUDIT, EXTENDED
@@ -37,6 +37,9 @@ from rfdropo_bayes.verbs.audit import audit
 from rfdropo_bayes.verbs.calibrate import calibrate
 from rfdropo_bayes.verbs.evaluate import CSV, evaluate
 from rfdropo_bayes.verbs.train import POLICY, train
+from studies import rivals  # noqa: F401 - it adds its methods to the table of the package
+
+COMMANDS["table2"] = RunKind(("table2.json", "table2.md", "table2.png"), resumable=True, shared=True)
 
 THRESHOLDS = (0.01525, 0.02157, 0.030)  # m, those of the paper's Table II
 PAPER = {"15.25": 0.32, "21.57": 0.56, "30": 0.60}  # RF-DROPO, TrunkPush on hardware
