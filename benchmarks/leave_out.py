@@ -43,7 +43,7 @@ from rfdropo_bayes.model.assembly import load_data
 from rfdropo_bayes.posteriors import RecordingPrediction, by_owner
 from rfdropo_bayes.prediction.predictive import predict_fitted, thin
 from rfdropo_bayes.prediction.session_error import SESSION_ERROR, left_out_sentence
-from rfdropo_bayes.report.residuals import predictive_bands
+from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import write_summary
 from rfdropo_bayes.tables import changed

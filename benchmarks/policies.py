@@ -23,10 +23,11 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from rfdropo_bayes.fem.integrators import Integrator
-from rfdropo_bayes.policies.episodes import make_episodes, spaces_of
+from rfdropo_bayes.policies.building import make_episodes
+from rfdropo_bayes.policies.ppo import ppo_options
 from rfdropo_bayes.policies.randomisation import Uniform
+from rfdropo_bayes.policies.spaces import spaces_of
 from rfdropo_bayes.policies.tasks import EPISODE, task_named
-from rfdropo_bayes.policies.training import ppo_options
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.robots.policy_layout import PolicyLayout
 

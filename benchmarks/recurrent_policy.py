@@ -17,7 +17,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecNormalize
 
 from rfdropo_bayes.policies.evaluation import draw_cases, play
-from rfdropo_bayes.policies.training import EVALUATION_SEED, LEAST_SPREAD, ppo_options
+from rfdropo_bayes.policies.ppo import ppo_options
+from rfdropo_bayes.policies.training import EVALUATION_SEED, LEAST_SPREAD
 from rfdropo_bayes.policies.training_config import TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 

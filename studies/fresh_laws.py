@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.actuation import NUMBERED, kept_over
-from rfdropo_bayes.mechanisms.sizes import half_normal
+from rfdropo_bayes.mechanisms.default_priors import half_normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec

@@ -15,8 +15,9 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Channel, Markers, ObjectPose, Seen
 from rfdropo_bayes.bayes.channels.channel import WhiteSeries
-from rfdropo_bayes.bayes.channels.object_pose import LEVER, draw_object_error, object_error, of_rotation_vector, product
+from rfdropo_bayes.bayes.channels.object_pose import LEVER, draw_object_error, object_error
 from rfdropo_bayes.bayes.channels.orientation import Orientation
+from rfdropo_bayes.bayes.channels.quaternions import of_rotation_vector, product
 from rfdropo_bayes.bayes.channels.tension import Tension, reading_size
 from rfdropo_bayes.bayes.channels.weighed import WeighedParts
 from rfdropo_bayes.bayes.problem import RolloutProblem, Values

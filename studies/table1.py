@@ -17,7 +17,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import Progress
 from rfdropo_bayes.model.run_folder import COMMANDS, LOG, RunKind, run_folder
-from rfdropo_bayes.report.summary import software_versions
+from rfdropo_bayes.report.facts import software_versions
 from studies.comparison import RIVALS, ROWS, fit, misleads
 from studies.fits import finished, run_fits
 from studies.rivals import import_sbi

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
+from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, Series
-from rfdropo_bayes.bayes.lanes import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
 from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result

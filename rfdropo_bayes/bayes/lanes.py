@@ -1,7 +1,4 @@
-"""A simulator behind compiled programs: rollouts and their derivatives, lane by lane, in batches of few sizes.
-
-Batches of any size through functions that are compiled for a few sizes.
-"""
+"""A simulator behind compiled programs: rollouts and their derivatives, lane by lane, in batches of few sizes."""
 
 from __future__ import annotations
 
@@ -16,13 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from rfdropo_bayes.bayes.batches import in_chunks
 from rfdropo_bayes.bayes.channels.object_pose import Placing
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.runtime import available_processors
 from rfdropo_bayes.simulators.commands import Commands
 from rfdropo_bayes.simulators.protocol import Simulator
-
-SMALLEST, GROWTH = 8, 4  # sizes that batches are padded to: 8, 32, 128, ...
 
 # Lanes of one call of an audit: a compilation costs more than the padding of a call, so that there is one size. Calls
 # with few different lanes are the most frequent.
@@ -234,60 +230,3 @@ class RoutedLanes(Lanes):
                 own = None if start is None else start[chosen]
                 results.append(lanes.roll(theta[chosen][:, kept], own, commands.of(chosen), check, steps, width))
         return jax.tree.map(lambda *parts: np.concatenate(parts)[np.argsort(order)], *results)
-
-
-def padded(function: Callable[[Any], Any], given: Any) -> Any:
-    """A function of arrays with a common first axis, evaluated on a padded batch; the padding repeats the last entry.
-
-    JAX compiles anew for every shape, which takes longer than a thousand evaluations of a prior.
-    """
-    count = len(jax.tree.leaves(given)[0])
-    if count == 0:
-        return function(given)
-    size = SMALLEST
-    while size < count:
-        size *= GROWTH
-    floats = jax.tree.map(lambda array: np.asarray(array, dtype=float), given)
-    return jax.tree.map(jnp.asarray, in_chunks(function, floats, (size,)))  # sliced by JAX, it would compile
-
-
-def in_chunks(
-    function: Callable[[Any], Any],
-    given: Any,
-    sizes: Sequence[int],
-    *,
-    before: Callable[[], None] = lambda: None,
-    after: Callable[[int], None] = lambda count: None,
-) -> Any:
-    """A function of arrays with a common first axis, evaluated chunk by chunk.
-
-    Args:
-        function: maps a tree of arrays to a tree of arrays.
-        given: the tree.
-        sizes: chunk sizes, ascending. All chunks but the last have the largest size; the last is padded to the smallest
-            sufficient size. The padding repeats the last entry.
-        before: function called before every chunk; may raise an exception.
-        after: called with the number of entries after every chunk.
-    """
-    count, parts = len(jax.tree.leaves(given)[0]), []
-    for start in range(0, count, sizes[-1]):
-        before()
-        remaining = min(count - start, sizes[-1])
-        index = np.minimum(np.arange(start, start + next(size for size in sizes if size >= remaining)), count - 1)
-        chunk = jax.tree.map(lambda array, index=index: np.asarray(array)[index], given)
-        parts.append(jax.device_get(function(chunk)))
-        after(remaining)
-    return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
-
-
-def chunk_sizes(largest: int) -> tuple[int, ...]:
-    """Sizes of chunks, ascending: a quarter of the next, down to the lanes of one SIMD register."""
-    sizes = [largest]
-    while sizes[-1] >= GROWTH * SMALLEST:
-        sizes.append(sizes[-1] // GROWTH)
-    return tuple(reversed(sizes))
-
-
-def is_batch(given: Any, axes: int) -> bool:
-    """Whether these are concrete arrays with ``axes`` axes, not JAX tracers."""
-    return all(not isinstance(a, jax.core.Tracer) and np.ndim(a) == axes for a in jax.tree.leaves(given))

@@ -12,10 +12,12 @@ import typer
 from rfdropo_bayes import __version__
 from rfdropo_bayes.cli import (
     audit_commands,
+    check_command,
     init_command,
     listing_commands,
     motor_commands,
     policy_commands,
+    prediction_commands,
     result_commands,
 )
 from rfdropo_bayes.cli.options import (
@@ -99,15 +101,15 @@ def simulate(
 # In the order in which they are used, which --help shows.
 for command in (
     init_command.init,
-    audit_commands.check,
+    check_command.check,
     simulate,
     result_commands.view,
     calibrate,
     result_commands.report,
     audit_commands.audit,
     audit_commands.design,
-    audit_commands.predict,
-    audit_commands.adapt,
+    prediction_commands.predict,
+    prediction_commands.adapt,
     result_commands.export,
     policy_commands.train,
     policy_commands.evaluate,

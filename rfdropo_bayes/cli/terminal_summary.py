@@ -64,7 +64,7 @@ def show_calibration(calibration: Calibration, experiment: Path | None = None) -
 
 def show_audit(content: Mapping[str, Any], folder: Path) -> None:
     """Print the result of an audit; ``content`` is of audit.json."""
-    from rfdropo_bayes.report.units import sentences
+    from rfdropo_bayes.report.sentences import sentences
 
     console = _console()
     verdict = Text(content["verdict"], style=f"bold {COLOURS.get(content['verdict'], '')}")

@@ -28,9 +28,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.data.commands_alone import commands_alone
-from rfdropo_bayes.data.counters import hold_time
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import Faults, fill_missing, find_faults
+from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.recorded import Measured, Origin, SentCommands
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError

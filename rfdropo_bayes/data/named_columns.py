@@ -20,9 +20,10 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 from scipy.spatial.transform import Rotation
 
 from rfdropo_bayes.data.command_notes import command_notes
-from rfdropo_bayes.data.counters import Column, Motion, counter_notes, hold_time, read_on, turns_of
+from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.recorded import Measured, Origin, Recorded, SentCommands
 from rfdropo_bayes.data.sample_times import TimeUnit, repeated_rows, rounded_notes, spread_repeats
 from rfdropo_bayes.errors import InputError

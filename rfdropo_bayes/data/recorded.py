@@ -12,7 +12,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.data import checks
-from rfdropo_bayes.data.counters import new_readings, present_readings
+from rfdropo_bayes.data.held_readings import new_readings, present_readings
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.errors import InputError
 

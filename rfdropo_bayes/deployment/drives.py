@@ -25,8 +25,9 @@ from rfdropo_bayes.deployment.cia402 import (
     controlword_towards,
     state_of,
 )
-from rfdropo_bayes.deployment.nodes import EDS_REMEDY, Node
+from rfdropo_bayes.deployment.nodes import Node
 from rfdropo_bayes.deployment.objects import Identifiers, Nmt, NmtState, Object, identifiers, of_axis
+from rfdropo_bayes.deployment.sheets import EDS_REMEDY
 from rfdropo_bayes.deployment.vendors import (
     LEFT_OUT,
     STANDARD,

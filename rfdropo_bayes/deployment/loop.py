@@ -1,8 +1,4 @@
-"""The control loop: set-points out and status in at every cycle, and every phase of a session from enabling to rest.
-
-Set-points: lengths within every motor's limits on length, rate and acceleration, for any commands. Detection of faults
-that end a running session, in the drives, the bus and the clock.
-"""
+"""The control loop: set-points out and status in at every cycle, and every phase of a session from enabling to rest."""
 
 from __future__ import annotations
 
@@ -18,220 +14,18 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.deployment.causes import Cause, Reaction, Stop
-from rfdropo_bayes.deployment.cia402 import DriveState, Status, controlword_towards
+from rfdropo_bayes.deployment.cia402 import DriveState, controlword_towards
 from rfdropo_bayes.deployment.clock import CycleClock, Tick
 from rfdropo_bayes.deployment.drives import Drive, Drives
 from rfdropo_bayes.deployment.log import SessionLog
-from rfdropo_bayes.deployment.objects import Nmt, NmtState, Object
+from rfdropo_bayes.deployment.objects import Nmt
 from rfdropo_bayes.deployment.policy import CommandSource, PolicyScene
 from rfdropo_bayes.deployment.sensors import MarkerView
+from rfdropo_bayes.deployment.setpoints import SetPoints
 from rfdropo_bayes.deployment.settings import SafetyTable
+from rfdropo_bayes.deployment.watch import AfterStop, Watch
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.robots import Motor, Robot
-
-MISSES_WITHIN_S = 1.0  # the time in which so many missed deadlines end a session
-
-
-class Watch:
-    """Checks every cycle and raises `Stop` on a fault.
-
-    Args:
-        drives: drives to check.
-        safety: fault tolerances.
-    """
-
-    def __init__(self, drives: Drives, safety: SafetyTable) -> None:
-        self._drives, self._safety = drives, safety
-        self._misses: deque[float] = deque()
-        self.missed = 0
-        self.begin()
-
-    def begin(self) -> None:
-        """Start the watch; earlier events do not count."""
-        self._short = [drive.short_frames for drive in self._drives.all]
-        self._drives.emergencies.clear()
-        self._started = time.monotonic()
-        self._lagging: dict[Drive, float] = {}  # since when
-
-    def check(self, tick: Tick, expected: DriveState | None, tension: bool = True) -> None:
-        """Check a cycle after its exchange.
-
-        Args:
-            tick: the cycle.
-            expected: state that every drive must be in; None while they are brought there.
-            tension: whether a tension above the limit counts.
-
-        Raises:
-            Stop: with the first cause found; causes that name a drive come first.
-        """
-        now = time.monotonic()
-        self._check_emergencies()
-        for number, drive in enumerate(self._drives.all):
-            if drive.short_frames > self._short[number]:
-                raise Stop(Cause.SHORT_FRAME, f"{drive.name} sent a status frame of the wrong length")
-            self._check_life(drive, now)
-            self._check_state(drive, expected)
-            if expected is DriveState.OPERATION_ENABLED:
-                self._check_lag(drive, now)
-            if tension and drive.reading is not None and drive.tension > drive.motor.tension_limit_n[1]:
-                limit = drive.motor.tension_limit_n[1]
-                raise Stop(Cause.TENSION, f"{drive.name} pulls {drive.tension:.1f} N, more than {limit:g} N")
-        self._check_deadlines(tick)
-
-    def _check_emergencies(self) -> None:
-        while self._drives.emergencies:
-            emergency = self._drives.emergencies.popleft()
-            drive = "drive " + " or ".join(map(repr, emergency.channels))  # a node does not name the axis
-            if emergency.code == 0x8611:
-                raise Stop(Cause.FOLLOWING_ERROR, f"{drive} does not follow its set-points")
-            if emergency.code:
-                raise Stop(Cause.EMERGENCY_MESSAGE, f"{drive} reports 0x{emergency.code:04X}")
-
-    def _check_life(self, drive: Drive, now: float) -> None:
-        quiet = now - max(drive.node.heartbeat, self._started)
-        if drive.node.nmt not in (None, NmtState.OPERATIONAL):
-            raise Stop(Cause.NODE_STATE, f"{drive.name} left OPERATIONAL (its heartbeat reports {drive.node.nmt})")
-        if quiet > self._safety.heartbeat_s:
-            raise Stop(Cause.HEARTBEAT_LOST, f"{drive.name}: no heartbeat for {1e3 * quiet:.0f} ms")
-        if drive.unanswered > self._safety.stale_cycles:
-            raise Stop(Cause.STALE_STATUS, f"{drive.name}: no status for {drive.unanswered} cycles")
-
-    def _check_state(self, drive: Drive, expected: DriveState | None) -> None:
-        if drive.reading is None:
-            return
-        state = drive.state
-        if state in (DriveState.FAULT, DriveState.FAULT_REACTION) and expected is not None:
-            raise Stop(Cause.DRIVE_STATE, f"{drive.name} is in {state.words}")
-        if expected is not None and state is not expected:
-            words = "an unknown state" if state is None else state.words
-            raise Stop(Cause.DRIVE_STATE, f"{drive.name} is in {words}, not in {expected.words}")
-        if expected is DriveState.OPERATION_ENABLED and drive.reading.statusword & Status.FOLLOWING_ERROR:
-            raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} lags behind its set-point")
-
-    def _check_lag(self, drive: Drive, now: float) -> None:
-        """A drive may repeat an old "operation enabled" forever; only its lack of motion reveals it."""
-        if drive.reading is None:
-            return
-        lag = abs(drive.target - drive.reading.position) / drive.motor.counts_per_metre
-        if lag <= self._safety.following_error_m:
-            self._lagging.pop(drive, None)
-        elif now - self._lagging.setdefault(drive, now) > self._safety.following_time_s:
-            raise Stop(Cause.FOLLOWING_ERROR, f"{drive.name} is {1e3 * lag:.1f} mm behind its set-point")
-
-    def _check_deadlines(self, tick: Tick) -> None:
-        if tick.missed:
-            self.missed += tick.missed
-            self._misses.extend([tick.time] * tick.missed)
-        while self._misses and self._misses[0] < tick.time - MISSES_WITHIN_S:
-            self._misses.popleft()
-        if len(self._misses) >= self._safety.misses:
-            raise Stop(Cause.DEADLINES, f"{len(self._misses)} deadlines missed within {MISSES_WITHIN_S:g} s")
-
-
-class AfterStop:
-    """Looks at drives after a quick stop, which they should hold: some enable themselves again, others let go.
-
-    Args:
-        drives: drives that are stopped.
-    """
-
-    def __init__(self, drives: Drives) -> None:
-        self._to_hold = [drive for drive in drives.all if drive.state in _HOLDING]
-        self._stopped: set[Drive] = set()
-        self.events: list[str] = []
-
-    def look(self) -> list[str]:
-        """Events since the last call; each drive is reported once."""
-        new = [line for drive in self._to_hold if (line := self._seen(drive))]
-        self._to_hold = [drive for drive in self._to_hold if not any(line.startswith(drive.name) for line in new)]
-        self.events += new
-        return new
-
-    def _seen(self, drive: Drive) -> str:
-        state = drive.state
-        if state is DriveState.QUICK_STOP_ACTIVE:
-            self._stopped.add(drive)
-        if state is DriveState.OPERATION_ENABLED and drive in self._stopped:
-            return f"{drive.name} enabled itself again after the quick stop"
-        if state not in _HOLDING and Object.QUICK_STOP_OPTION not in drive.unguarded:  # else its owner bears that
-            words = "an unknown state" if state is None else state.words
-            return f"{drive.name} let its cable go after the quick stop: it is in {words}"
-        return ""
-
-
-_HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
-
-
-class SetPoints:
-    """Set-points of all motors, one step per cycle.
-
-    A step never exceeds the limits on rate and acceleration, and always leaves the distance needed to stop at the goal.
-    A goal within the limits on length is therefore never overshot.
-
-    Args:
-        motors: give the limits.
-        period: length of the cycle [s].
-        length: initial length, at rest [m].
-    """
-
-    def __init__(self, motors: Sequence[Motor], period: float, length: Float[np.ndarray, " motor"]) -> None:
-        self.period = period
-        self.low = np.array([motor.length_limit_m[0] for motor in motors])
-        self.high = np.array([motor.length_limit_m[1] for motor in motors])
-        self.rate_limit = np.array([motor.rate_limit_m_s for motor in motors])
-        self.acceleration_limit = np.array([motor.acceleration_limit_m_s2 for motor in motors])
-        self.length = np.array(length, dtype=float)
-        self.rate = np.zeros(len(motors))
-
-    def clamp(self, length: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
-        """The nearest lengths within the limits; a motor that stands outside them may stay or come back."""
-        return np.clip(length, np.minimum(self.low, self.length), np.maximum(self.high, self.length))
-
-    def towards(
-        self,
-        goal: Float[np.ndarray, " motor"],
-        ramp: Float[np.ndarray, " motor"] | None = None,
-        rate_limit: Float[np.ndarray, " motor"] | float = np.inf,
-    ) -> Float[np.ndarray, " motor"]:
-        """The next set-points [m].
-
-        Args:
-            goal: end of the motion [m].
-            ramp: planned set-point at the next cycle [m]; the goal itself by default.
-            rate_limit: rate limit below the motors' own [m/s].
-        """
-        ramp = goal if ramp is None else ramp  # ramps that overlap may pass the goal, and come back
-        fastest = np.minimum(self.rate_limit, rate_limit)
-        above = np.maximum(0.0, np.maximum(goal, ramp) - self.length)
-        below = np.maximum(0.0, self.length - np.minimum(goal, ramp))
-        upper = np.minimum(fastest, self._stopping_rate(above))
-        lower = -np.minimum(fastest, self._stopping_rate(below))
-        return self._step(np.clip((ramp - self.length) / self.period, lower, upper))
-
-    def _stopping_rate(self, distance: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
-        """Largest rate from which steps of the acceleration limit still end within a distance, this step included.
-
-        In units of a dt the rate is k + f, with 0 <= f < 1, and the way of all its steps a dt^2 (k + 1) (k / 2 + f).
-        """
-        steps = 2.0 * distance / (self.acceleration_limit * self.period**2)
-        whole = np.floor(0.5 * (np.sqrt(1.0 + 4.0 * steps) - 1.0))
-        return 0.5 * self.acceleration_limit * self.period * (whole + steps / (whole + 1.0))
-
-    def halt(self) -> Float[np.ndarray, " motor"]:
-        """The next set-points on the shortest way to rest."""
-        return self._step(np.zeros_like(self.rate))
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether nothing moves."""
-        return bool(np.all(self.rate == 0.0))
-
-    def _step(self, wanted: Float[np.ndarray, " motor"]) -> Float[np.ndarray, " motor"]:
-        change = self.acceleration_limit * self.period
-        self.rate = np.clip(wanted, self.rate - change, self.rate + change)
-        self.length = self.length + self.period * self.rate
-        return self.length
-
+from rfdropo_bayes.robots import Robot
 
 _AWAY = 1e-4  # [m]: a braked drive farther than this from its command holds another command
 _ANSWER = 0.6  # of a period: how long a cycle waits for the drives; the rest is for policy, log and sleep

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.bayes.lanes import padded
+from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.priors import log_density
 from rfdropo_bayes.bayes.scopes import Scopes
 

@@ -14,8 +14,9 @@ from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, best_between, heights,
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.gain import noise_distance
 from rfdropo_bayes.discrepancy.inadequacy import as_measured, misspecified
+from rfdropo_bayes.discrepancy.omnibus import Omnibus
 from rfdropo_bayes.discrepancy.score import likeness, project_out, signature, span
-from rfdropo_bayes.discrepancy.score_tests import Omnibus, ScoreRow, ScoreTests, run_score_tests
+from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests, run_score_tests
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])

@@ -22,15 +22,8 @@ from rfdropo_bayes.discrepancy.deadline import OutOfTime
 from rfdropo_bayes.discrepancy.differences import Groups
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
-from rfdropo_bayes.discrepancy.port_responses import (
-    PortEvidence,
-    Responses,
-    evidences,
-    feature_columns,
-    responses,
-    under,
-    with_exact_columns,
-)
+from rfdropo_bayes.discrepancy.port_evidence import PortEvidence, evidences
+from rfdropo_bayes.discrepancy.port_responses import Responses, feature_columns, responses, under, with_exact_columns
 from rfdropo_bayes.discrepancy.port_rollouts import (
     EVERYWHERE,
     PREFIX,

@@ -14,14 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from rfdropo_bayes.bayes.lanes import STEP, Fields, Lanes, chunk_sizes, in_chunks
+from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
+from rfdropo_bayes.bayes.lanes import STEP, Fields, Lanes
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.forward import Forward, Points
 from rfdropo_bayes.discrepancy.journal import digest
+from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.mechanisms.features import Feature, gauges_of, motion_dictionary
 from rfdropo_bayes.mechanisms.laws import FAR, shape_spec, unit_of
 from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
-from rfdropo_bayes.mechanisms.sizes import normal
 from rfdropo_bayes.simulators.callbacks import distinct
 from rfdropo_bayes.simulators.commands import Commands, observed_at
 from rfdropo_bayes.simulators.extended import ExtendedSimulator

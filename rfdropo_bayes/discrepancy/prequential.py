@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy.stats import chi2
 
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
-from rfdropo_bayes.discrepancy.score_tests import BLOCK
+from rfdropo_bayes.discrepancy.omnibus import BLOCK
 
 BEGINNING = (
     "Only the first block fails: was another command in force before the first row than these recordings "

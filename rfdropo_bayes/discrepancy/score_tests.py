@@ -3,8 +3,6 @@
 All p-values come from a parametric bootstrap: residuals are simulated under a right model. Noise is drawn for every
 recording, the noise model is estimated as for the data, and the base model is refitted linearly. No rollouts are
 needed.
-
-Whether anything is wrong at all: tests of the whitened residuals against independent unit normals, as one.
 """
 
 from __future__ import annotations
@@ -14,34 +12,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
-from scipy.stats import norm
+from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise.autoregression import MISFIT, RESIDUALS, STATED
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.candidates import Probe
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.omnibus import Omnibus, block_squares, joint_test, statistics
 from rfdropo_bayes.discrepancy.score import project_out, span, statistic
-
-BLOCK = 10  # rows
-LAGS = 10
-
-
-@dataclass(frozen=True)
-class Omnibus:
-    """Result of the joint test.
-
-    Attributes:
-        p: p-value of the joint test: the smallest of the single p-values, calibrated as such.
-        single: p-value of each test on its own.
-        blocks: mean square of each block of rows, over channels and groups; 1 if the model is right.
-    """
-
-    p: float
-    single: dict[str, float]
-    blocks: Float[np.ndarray, " block"]
-
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
 DIRECTED = "candidates"
@@ -213,76 +192,3 @@ def p_in_words(p: float, simulated: int) -> str:
     """A bootstrap's p-value, "= 0.02"; "< 0.001" if no simulated statistic was as large."""
     least = 1.0 / (1 + simulated)
     return f"= {p:.2g}" if p > 1.5 * least else f"< {least:.2g}"
-
-
-def statistics(white: Float[np.ndarray, "*batch group time channel"]) -> dict[str, Float[np.ndarray, "*batch"]]:
-    """Statistics that are large for a wrong model.
-
-    - variance: mean square (lack of fit against pure error);
-    - blocks: squares of the means of `BLOCK` rows, per channel;
-    - modes: the largest share of these in a single pattern over the channels;
-    - memory: Ljung-Box over `LAGS` lags, pooled over channels;
-    - distribution: Kolmogorov-Smirnov distance of the PIT.
-    """
-    axes = (-3, -2, -1)
-    rows = white.shape[-2]
-    square = np.mean(white**2, axis=axes)
-    means = block_means(white)
-    flat = means.reshape(*means.shape[:-3], -1, means.shape[-1])
-    gram = np.swapaxes(flat, -1, -2) @ flat
-    pooled = []
-    for lag in range(1, min(LAGS, rows - 1) + 1):
-        pooled.append(np.mean(white[..., lag:, :] * white[..., :-lag, :], axis=axes) / np.maximum(square, 1e-12))
-    memory = np.sum(np.stack(pooled) ** 2, axis=0)
-    ranks = np.sort(white.reshape(*white.shape[:-3], -1), axis=-1)
-    ladder = (np.arange(ranks.shape[-1]) + 0.5) / ranks.shape[-1]
-    return {
-        "variance": square,
-        "blocks": np.mean(means**2, axis=axes),
-        "modes": np.linalg.eigvalsh(gram)[..., -1],
-        "memory": memory,
-        "distribution": np.max(np.abs(norm.cdf(ranks) - ladder), axis=-1),
-    }
-
-
-def block_means(white: Float[np.ndarray, "*batch group time channel"]) -> Float[np.ndarray, "*batch group b channel"]:
-    """Means of successive rows, scaled to unit variance; rows beyond the last whole block are left out."""
-    size = min(BLOCK, white.shape[-2])
-    count = white.shape[-2] // size
-    cut = white[..., : count * size, :]
-    return cut.reshape(*cut.shape[:-2], count, size, cut.shape[-1]).sum(axis=-2) / np.sqrt(size)
-
-
-def block_squares(
-    white: Float[np.ndarray, "group time channel"], valid: Bool[np.ndarray, "group time channel"]
-) -> Float[np.ndarray, " block"]:
-    """Mean square of the means of blocks of rows, over groups and channels, 1 if the model is right; unmeasured rows
-    are skipped, and an empty block is NaN.
-    """
-    size = min(BLOCK, white.shape[-2])
-    measured = np.round(np.sqrt(size) * block_means(valid.astype(float)))
-    sums = np.sqrt(size) * block_means(np.where(valid, white, 0.0))
-    count = np.sum(measured, axis=(0, 2))
-    return np.where(count > 0, np.sum(sums**2, axis=(0, 2)) / np.maximum(count, 1.0), np.nan)
-
-
-def joint_test(
-    observed: dict[str, float], simulated: dict[str, Float[np.ndarray, " count"]], blocks: Float[np.ndarray, " block"]
-) -> Omnibus:
-    """Calibrate each statistic, and the smallest p-value of all, against the simulated statistics.
-
-    The observed data set is ranked among the simulated data sets in both steps: under a right model it is one of them,
-    and the joint p-value is then valid at any level. Ties in the smallest p-value are broken by the distance from the
-    median.
-    """
-    pooled = {name: np.append(simulated[name], observed[name]) for name in observed}
-    p_values, distances = {}, []  # of each statistic among all; from the median, in distances of the 95 % quantile
-    for name, values in pooled.items():
-        p_values[name] = (len(values) - np.searchsorted(np.sort(values), values, side="left")) / len(values)
-        middle, high = np.quantile(values, [0.5, 0.95])
-        distances.append((values - middle) / max(high - middle, 1e-300))
-    each = np.stack(list(p_values.values()))
-    smallest = each.min(axis=0)
-    out = np.where(each == smallest, np.stack(distances), -np.inf).max(axis=0)
-    p = np.mean((smallest < smallest[-1]) | ((smallest == smallest[-1]) & (out >= out[-1])))
-    return Omnibus(float(p), {name: float(rank[-1]) for name, rank in p_values.items()}, blocks)

@@ -13,14 +13,6 @@ from rfdropo_bayes.fem.chambers import chamber_layout  # noqa: E402
 from rfdropo_bayes.fem.dynamics import Material, System, material, prepare, state_at_rest, step, without_cables  # noqa: E402
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Viscoelasticity, Wall  # noqa: E402
 from rfdropo_bayes.fem.equilibrium import static_equilibrium  # noqa: E402
-from rfdropo_bayes.fem.rod import (  # noqa: E402
-    PointMap,
-    Rod,
-    attach,
-    point_positions,
-    profile_rod,
-    refined,
-    solid_torsion_constant,
-    uniform_rod,
-)
+from rfdropo_bayes.fem.points import point_positions  # noqa: E402
+from rfdropo_bayes.fem.rod import PointMap, Rod, attach, profile_rod, refined, solid_torsion_constant, uniform_rod  # noqa: E402
 from rfdropo_bayes.fem.rollouts import simulate  # noqa: E402

@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from rfdropo_bayes.fem.components import rotation
 from rfdropo_bayes.fem.effects import Scalar
+from rfdropo_bayes.fem.points import point_positions
 from rfdropo_bayes.fem.rigid_body import CORNERS, Cube, CubeState, rotation_matrix
-from rfdropo_bayes.fem.rod import PointMap, Rod, attach, point_positions
+from rfdropo_bayes.fem.rod import PointMap, Rod, attach
 
 NEAREST = 24
 """Spheres that the reference engine looks at, nearest to the cube and to the plate: more than ever come near them."""

@@ -3,8 +3,6 @@
 A rod has six unknowns a station: the position of the centre line and the rotation of the section. A section does not
 deform: guides, markers and loads sit rigidly on sections. Between stations the centre line is Hermite's cubic through
 both stations and along both sections' normals, so a point there is a weighted sum of positions and of rotated arms.
-
-Positions of material points of a rod in space.
 """
 
 from __future__ import annotations
@@ -12,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem.components import rotation, times
 
 SHEAR = 5.0 / 6.0
 """Shear area over the section's area. The form of the shear law moves the tip of a slender body by a thousandth."""
@@ -191,12 +187,3 @@ def inertia_per_density(body: Rod) -> tuple[Float[np.ndarray, " stations"], Floa
     none = np.zeros((1, 4))
     total = np.concatenate([parts, none]) + np.concatenate([none, parts])
     return total[:, 0], total[:, 1:]
-
-
-def point_positions(
-    points: PointMap, position: Float[Array, "stations 3"], orientation: Float[Array, "stations 4"]
-) -> Float[Array, "points 3"]:
-    """Positions of attached points [m], from the places of the stations and the quaternions of their sections."""
-    frame = rotation(orientation.T)[:, :, points.station]
-    lever = times(frame, jnp.asarray(points.arm.transpose(2, 0, 1)))
-    return jnp.sum(points.weight * position.T[:, points.station] + lever, axis=2).T

@@ -15,9 +15,10 @@ from rfdropo_bayes.fem.dynamics import Prepared, State, StepInfo, System, rememb
 from rfdropo_bayes.fem.effects import Scalar
 from rfdropo_bayes.fem.equilibrium import quasi_static_step
 from rfdropo_bayes.fem.integrators import Integrator
+from rfdropo_bayes.fem.points import point_positions
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube
-from rfdropo_bayes.fem.rod import PointMap, point_positions
+from rfdropo_bayes.fem.rod import PointMap
 from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
 
 

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from rfdropo_bayes.mechanisms.sizes import USUAL, half_normal, log_normal, normal, scaled
+from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
+from rfdropo_bayes.mechanisms.sizes import USUAL, scaled
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.cable import Cable
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
@@ -69,54 +70,9 @@ class CommandDelay:
     inside_drive = True
     cause = "communication and drive latency"
     remedy = "stamp commands at their execution, or shift the clock by this much"
-    parameters = (ParameterSpec("command_delay", "s", 0.0, 2.0, 0.0, half_normal(0.1), "delay of every command"),)
-
-    def actuate(
-        self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
-    ) -> Float[Array, "step channel"]:
-        """Read the command ``command_delay`` earlier, linearly between steps."""
-        history = jnp.concatenate([initial[None], command])
-        late = values["command_delay"] / time_step
-        return _read_late(jnp.arange(1, len(history)), late, lambda step: history[step])
-
-    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
-        """Commands of the last steps, as far back as a delay may reach, and the number of steps."""
-        steps = math.ceil(self.parameters[0].high / interval) + 2
-        return jnp.broadcast_to(first, (steps, *first.shape)), jnp.zeros((), int)
-
-    def advance(
-        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
-    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
-        """Read the command ``command_delay`` earlier; the oldest one is overwritten."""
-        last, step = memory[0], memory[1] + 1
-        last = last.at[step % len(last)].set(given)
-        reached = _read_late(step, values["command_delay"] / now, lambda at: last[at % len(last)])
-        return (last, step), reached
-
-
-class CableDelay:
-    """Each command acts by its own delay late; zero at null. Equal delays of all are `command_delay`'s.
-
-    Args:
-        channels: names of the command channels; numbers by default.
-    """
-
-    name = "cable_delay"
-    stage = "actuation"
-    inside_drive = True
-    cause = "a drive that answers later than others: its bus, its controller, or its own filter"
-    remedy = "command all drives at once, and compare the stamps of their first motion"
-
-    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
-        self.parameters = tuple(
-            ParameterSpec(f"cable_delay_{channel}", "s", 0.0, 2.0, 0.0, half_normal(0.1), f"delay of {channel}")
-            for channel in channels
-        )
-
-    @classmethod
-    def for_robot(cls, robot: Robot) -> CableDelay:
-        """One delay for every command channel of a robot."""
-        return cls(robot.channel_names)
+    parameters: tuple[ParameterSpec, ...] = (
+        ParameterSpec("command_delay", "s", 0.0, 2.0, 0.0, half_normal(0.1), "delay of every command"),
+    )
 
     def actuate(
         self, values: Values, command: Float[Array, "step channel"], initial: Float[Array, " channel"], time_step: float
@@ -137,6 +93,35 @@ class CableDelay:
         last, step = memory[0], memory[1] + 1
         last = last.at[step % len(last)].set(given)
         return (last, step), self._late(values, now, step, last)
+
+    def _late(
+        self, values: Values, interval: float, step: Int[Array, "*step"], history: Float[Array, "kept channel"]
+    ) -> Float[Array, "*step channel"]:
+        """Commands in force at steps, from a history whose places are reused in turn."""
+        return _read_late(step, values["command_delay"] / interval, lambda at: history[at % len(history)])
+
+
+class CableDelay(CommandDelay):
+    """Each command acts by its own delay late; zero at null. Equal delays of all are `command_delay`'s.
+
+    Args:
+        channels: names of the command channels; numbers by default.
+    """
+
+    name = "cable_delay"
+    cause = "a drive that answers later than others: its bus, its controller, or its own filter"
+    remedy = "command all drives at once, and compare the stamps of their first motion"
+
+    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
+        self.parameters = tuple(
+            ParameterSpec(f"cable_delay_{channel}", "s", 0.0, 2.0, 0.0, half_normal(0.1), f"delay of {channel}")
+            for channel in channels
+        )
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> CableDelay:
+        """One delay for every command channel of a robot."""
+        return cls(robot.channel_names)
 
     def _late(
         self, values: Values, interval: float, step: Int[Array, "*step"], history: Float[Array, "kept channel"]

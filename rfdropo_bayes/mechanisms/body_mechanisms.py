@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from rfdropo_bayes.fem import BendingLaw, Material, Rod, Viscoelasticity, Wall
-from rfdropo_bayes.mechanisms.sizes import half_normal, log_normal, normal
+from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.mechanisms.actuation import InCommandUnit
-from rfdropo_bayes.mechanisms.sizes import normal
+from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec

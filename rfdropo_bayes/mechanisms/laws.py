@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms.default_priors import normal
 from rfdropo_bayes.mechanisms.features import GAUGES, KINDS, OWN_NAME, Feature, feature_named, gauges_of
 from rfdropo_bayes.mechanisms.ports import Port, PortMap, sensed
-from rfdropo_bayes.mechanisms.sizes import normal
 from rfdropo_bayes.simulators.commands import sample
 from rfdropo_bayes.simulators.mechanisms import Meanwhile, Mechanism, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec

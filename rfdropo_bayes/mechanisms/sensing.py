@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.mechanisms.sizes import half_normal, normal
+from rfdropo_bayes.mechanisms.default_priors import half_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec

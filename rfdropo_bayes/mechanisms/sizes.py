@@ -5,8 +5,6 @@ lengths scale with the pull of usual commands, other lengths with the body's len
 Forces scale with the tension (or thrust of a chamber) that bends the body by a usual pull: the pull times Young's
 modulus over the integral of ``radius^2 / I`` along the cable. Times, angles and ratios stay, and so does the density of
 a fluid around the body.
-
-Default priors of mechanisms, as the tables of an experiment file; scales are in the parameter's unit.
 """
 
 from __future__ import annotations
@@ -79,18 +77,3 @@ def sized(spec: ParameterSpec, scales: Scales) -> ParameterSpec:
     made = scaled(spec, float(np.prod(ratios ** np.array(powers))))
     # Bounds are limits of the physics, and never narrower than those of the usual trunk.
     return made._replace(low=min(made.low, spec.low), high=max(made.high, spec.high))
-
-
-def normal(scale: float, loc: float = 0.0) -> dict[str, Any]:
-    """Normal prior of an effect of either sign."""
-    return {"distribution": "Normal", "loc": loc, "scale": scale}
-
-
-def half_normal(scale: float) -> dict[str, Any]:
-    """Half-normal prior of an effect that cannot be negative."""
-    return {"distribution": "HalfNormal", "scale": scale}
-
-
-def log_normal(median: float, sigma: float) -> dict[str, Any]:
-    """Log-normal prior of a time that is known to a factor of exp(sigma)."""
-    return {"distribution": "LogNormal", "median": median, "sigma": sigma}

@@ -14,7 +14,7 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.priors import table_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
-from rfdropo_bayes.data.unseen import given_recordings
+from rfdropo_bayes.data.given_recordings import given_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import (
     build_model,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rfdropo_bayes.data.mapped_formats import FORMATS
+from rfdropo_bayes.data.format_descriptions import FORMATS
 from rfdropo_bayes.robots import Robot, find_robot_file, known_robots
 
 if TYPE_CHECKING:

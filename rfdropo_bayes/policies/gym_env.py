@@ -7,8 +7,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from rfdropo_bayes.policies.episodes import make_episodes, spaces_of
+from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.rendering import picture
+from rfdropo_bayes.policies.spaces import spaces_of
 from rfdropo_bayes.policies.tasks import PERIOD
 
 

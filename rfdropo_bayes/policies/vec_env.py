@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from rfdropo_bayes.policies.episodes import Episodes, EpisodeStep, spaces_of
+from rfdropo_bayes.policies.episodes import Episodes, EpisodeStep
 from rfdropo_bayes.policies.randomisation import Randomisation
 from rfdropo_bayes.policies.rendering import picture
+from rfdropo_bayes.policies.spaces import spaces_of
 
 
 class TrunkVecEnv(VecEnv):

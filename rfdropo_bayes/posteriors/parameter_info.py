@@ -1,44 +1,13 @@
-"""Facts about an inferred parameter, and its owner (a recording, a group or none).
-
-Whether draws are piled up at a bound, for bounds of any width, or lie in a region of little prior mass. Named
-quantities that are functions of the parameters, such as the ratio of stiffness to density.
-"""
+"""Facts about an inferred parameter, and its owner (a recording, a group or none)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-
-from rfdropo_bayes.errors import InputError
-
-
-@dataclass(frozen=True)
-class ProductOfPowers:
-    """A product of powers of positive parameters: in logarithms a weighted sum.
-
-    Every combination that a scale ridge leaves determined has this form (E / density, friction / E, ...).
-    """
-
-    parameter: str  # name of the quantity
-    unit: str  # SI unit, "-" if it has none
-    powers: Mapping[str, float]  # exponent of each parameter, ``{"young_modulus": 1, "density": -1}``
-    description: str = ""  # one line on its physical meaning
-    owner: str = ""  # the recording or group that has it; empty if all share it
-
-    @property
-    def name(self) -> str:
-        """Its label, see `ParameterInfo.name`."""
-        return label(self.parameter, self.owner)
-
-
-OUTERMOST = 0.005  # of the prior, on either side
-SPARSE = 0.1  # of the mean density between the quartiles
-NEIGHBOURS = 5  # prior draws on the denser side, which estimate the density at a place
-PILED = 0.13  # of a standard deviation, between a half-normal (0.10) and a uniform distribution (0.17)
 
 Draws = Mapping[str, Float[np.ndarray, " n"]]
 
@@ -123,78 +92,3 @@ def by_owner(infos: Iterable[ParameterInfo], draws: Draws) -> dict[str, dict[str
         if info.name in draws:
             owned.setdefault(info.parameter, {})[info.scope.owner] = np.asarray(draws[info.name])
     return owned
-
-
-def cut_off_at(draws: Float[np.ndarray, " n"], low: float, high: float, *, logarithmic: bool = False) -> str | None:
-    """The end, "low" or "high", at which a distribution is cut off at its mode; None if neither is.
-
-    Its outer 5 % quantile then lies within a tenth of a standard deviation of that end.
-
-    Args:
-        draws: draws of one parameter.
-        low, high: ends of its range; infinite without an end.
-        logarithmic: compare positive draws in logarithms.
-    """
-    if logarithmic and np.all(draws > 0):
-        draws = np.log(draws)
-        low = np.log(low) if low > 0 else -np.inf
-        high = np.log(high) if high > 0 else -np.inf
-    q05, q95 = np.quantile(draws, [0.05, 0.95])
-    reach = PILED * draws.std()
-    if q05 - low <= reach:
-        return "low"
-    return "high" if high - q95 <= reach else None
-
-
-def contradicts(draws: Float[np.ndarray, " n"], prior: Float[np.ndarray, " m"]) -> bool:
-    """Whether the median of a posterior lies in the outermost 1 % of its prior, in a region of low prior density; False
-    if there are too few draws.
-
-    The ends of a wide uniform prior, zero of a half-normal prior, and zero of a log-normal prior over decades are
-    outermost but dense.
-
-    Args:
-        draws: draws of one parameter's posterior.
-        prior: draws of the parameter's prior, at least 400.
-    """
-    prior, centre = np.sort(prior[np.isfinite(prior)]), float(np.median(draws))
-    n, below = len(prior), int(np.searchsorted(prior, centre))
-    if n < 2.0 / OUTERMOST or OUTERMOST * n <= below <= (1.0 - OUTERMOST) * n:
-        return False
-    distances = (
-        np.sort(np.abs(prior[below:] - centre))[:NEIGHBOURS],
-        np.sort(np.abs(prior[:below] - centre))[:NEIGHBOURS],
-    )
-    nearest = min(side[-1] for side in distances if len(side) == NEIGHBOURS)
-    low, high = np.quantile(prior, [0.25, 0.75])
-    return bool(NEIGHBOURS / n * (high - low) < SPARSE * 0.5 * nearest)
-
-
-def contradiction(names: Sequence[str]) -> str:
-    """The clause about parameters whose posterior `contradicts` the prior."""
-    return (
-        f"the data put {', '.join(names)} into the outermost {200 * OUTERMOST:.0f} % of the prior, which excludes them"
-    )
-
-
-def evaluate_products(
-    draws: Mapping[str, Float[np.ndarray, "..."]], products: Sequence[ProductOfPowers]
-) -> dict[str, Float[np.ndarray, "..."]]:
-    """Values of each product at each draw.
-
-    Raises:
-        InputError: a product that names an unknown parameter or one that is not positive, or that takes its name.
-    """
-    values = {}
-    for product in products:
-        where = f"derived quantity {product.name!r}"
-        unknown = [name for name in product.powers if name not in draws]
-        if unknown:
-            raise InputError(f"unknown parameter {unknown[0]!r}", where=where, remedy=f"known: {', '.join(draws)}")
-        if product.name in draws:
-            raise InputError("has the name of a parameter", where=where, remedy="choose another name")
-        for name in product.powers:
-            if not np.all(draws[name] > 0):
-                raise InputError(f"{name} is not always positive", where=where, remedy="leave it out")
-        values[product.name] = np.exp(sum(power * np.log(draws[name]) for name, power in product.powers.items()))
-    return values

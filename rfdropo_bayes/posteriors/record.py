@@ -14,6 +14,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
 from rfdropo_bayes.posteriors.inference_data import (
     InferenceData,
     in_arviz,
@@ -22,7 +23,7 @@ from rfdropo_bayes.posteriors.inference_data import (
     to_tree,
     variable_key,
 )
-from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, ProductOfPowers, Scope, evaluate_products
+from rfdropo_bayes.posteriors.parameter_info import ParameterInfo, Scope
 
 AXES = ("x", "y", "z")
 DRAWS = "draws"  # attribute of a prediction: how many draws are its own

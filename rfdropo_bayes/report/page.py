@@ -14,15 +14,16 @@ from markupsafe import Markup, escape
 from rfdropo_bayes.discrepancy.candidates import spoken
 from rfdropo_bayes.discrepancy.score_tests import p_in_words
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, RecordingPrediction
-from rfdropo_bayes.posteriors.parameter_info import PILED
+from rfdropo_bayes.posteriors.bounds import PILED
 from rfdropo_bayes.report import check_figures, posterior_figures, trajectory_figures
+from rfdropo_bayes.report.coverage import coverage, transform_curve
 from rfdropo_bayes.report.headline import best_baseline
 from rfdropo_bayes.report.replay import replay, tracks_of
-from rfdropo_bayes.report.residuals import coverage, transform_curve
 from rfdropo_bayes.report.robot_figure import robot_figure
 from rfdropo_bayes.report.scores import MeasuredPath, settled_rows
+from rfdropo_bayes.report.sentences import sentences
 from rfdropo_bayes.report.style import Picture, embed
-from rfdropo_bayes.report.units import display_name, display_unit, sentences
+from rfdropo_bayes.report.units import display_name, display_unit
 
 MOST_RECORDINGS = 8
 NOTHING = "\u2013"

@@ -17,7 +17,7 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.sample_times import sample_time
 from rfdropo_bayes.posteriors import RecordingPrediction
 from rfdropo_bayes.report import style
-from rfdropo_bayes.report.residuals import predictive_bands
+from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.robot_figure import draw_side
 from rfdropo_bayes.report.scores import MILLIMETRES
 

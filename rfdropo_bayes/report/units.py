@@ -1,15 +1,8 @@
-"""Units and names as people read them.
-
-Verdicts of several sentences, for a line each.
-"""
+"""Units and names as people read them."""
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
-
-END = re.compile(r"(?<=[^\s.]\.)\s+(?=[A-Z])")
 
 _PREFIXED = {"Pa", "m", "s", "N", "Hz"}
 _PREFIX = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
@@ -36,8 +29,3 @@ def _tidy(unit: str) -> str:
 def display_name(name: str) -> str:
     """Parameter name with spaces, which breaks better than underscores."""
     return name.replace("_", " ")
-
-
-def sentences(text: str) -> list[str]:
-    """The sentences of a verdict; a full stop inside a number or a name does not end a sentence."""
-    return END.split(text)

@@ -22,8 +22,8 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import RunSettings, Workpiece, spec_of
 from rfdropo_bayes.report import audit_figures as figures
 from rfdropo_bayes.report.audit_figures import Shown
+from rfdropo_bayes.report.sentences import sentences
 from rfdropo_bayes.report.trajectory_figures import AXES
-from rfdropo_bayes.report.units import sentences
 from rfdropo_bayes.results.calibrated import axes_or_new
 from rfdropo_bayes.results.named_entries import entry_number
 from rfdropo_bayes.tables import nearest, parse_table

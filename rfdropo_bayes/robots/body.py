@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field, model_validator
 
-from rfdropo_bayes.robots.parameter import Name, Pair, Positive, RobotTable
+from rfdropo_bayes.robots.table import Name, Pair, Positive, RobotTable
 
 
 def poisson_terms(poisson_ratio: Any, reference: float) -> tuple[Any, Any, Any]:

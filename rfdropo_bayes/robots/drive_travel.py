@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import whole
-from rfdropo_bayes.robots.parameter import RobotTable
+from rfdropo_bayes.robots.table import RobotTable
 from rfdropo_bayes.tables import nearest
 
 ROUNDING = 1e-9  # how far [m or rad] a sum of commands may be beyond a limit that it reaches exactly

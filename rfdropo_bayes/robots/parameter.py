@@ -1,27 +1,13 @@
-"""Physical parameters of a robot: unit, nominal value, hard bounds and a default prior.
-
-Base class of the tables of a robot file: no unknown keys, no infinities, immutable.
-"""
+"""Physical parameters of a robot: unit, nominal value, hard bounds and a default prior."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from rfdropo_bayes.robots.table import RobotTable
 from rfdropo_bayes.tables import nearest
-
-Vector = Annotated[tuple[float, float, float], Field(description="x, y, z in the frame of the robot's base")]
-Pair = tuple[float, float]
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
-Positive = Annotated[float, Field(gt=0.0)]
-
-
-class RobotTable(BaseModel):
-    """A table of a robot file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
 
 ARGUMENTS = {
     "Normal": ("loc", "scale"),

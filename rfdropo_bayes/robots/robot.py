@@ -1,7 +1,5 @@
 """A robot: body, mount, cables, chambers, commands, markers, parameters and, for pushing, an object on a plate.
 
-Shape of a robot at rest, as plain numbers for a picture.
-
 Implausible numbers in a robot's description, such as millimetres given as metres.
 
 Bounds lie far beyond existing robots: they catch wrong units (factors of a thousand), not bad guesses.
@@ -20,11 +18,14 @@ from pydantic import Field, PrivateAttr, model_validator
 from rfdropo_bayes.cautions import Caution
 from rfdropo_bayes.groups import Patterns, group_of, whole
 from rfdropo_bayes.robots.body import Body
-from rfdropo_bayes.robots.cable import Cable, Chamber, Channels, Motor
+from rfdropo_bayes.robots.cable import Cable, Channels
 from rfdropo_bayes.robots.catalogue import find_robot_file, robot_tables
+from rfdropo_bayes.robots.chamber import Chamber
 from rfdropo_bayes.robots.drive_travel import DriveTravel, Travel, travel_in, unstated_travel
+from rfdropo_bayes.robots.motor import Motor
 from rfdropo_bayes.robots.outline import RobotOutline, not_given, outlined_tables
-from rfdropo_bayes.robots.parameter import Name, Parameter, Positive, RobotTable, Vector
+from rfdropo_bayes.robots.parameter import Parameter
+from rfdropo_bayes.robots.table import Name, Positive, RobotTable, Vector
 from rfdropo_bayes.signatures import see_keywords, with_keywords_of
 from rfdropo_bayes.tables import changed, nearest, parse_table
 
@@ -449,23 +450,6 @@ class Robot(RobotTable):
         names, placement = self.body.point_mass_placement()
         values = [parameters.get(name, self.parameters[name].nominal) for name in names]
         return sum((placement[:, i] * value for i, value in enumerate(values)), np.zeros(len(placement)))
-
-
-def robot_shape(robot: Robot) -> dict[str, Any]:
-    """Section widths along the axis, cables from anchor to last guide, chambers from end to end, markers, and gravity.
-
-    All in metres and the base frame: ``station`` and ``half_width`` (x, y) of the body, ``cables``, with
-    the chambers, and ``markers`` as points by name, ``gravity`` in m/s2.
-    """
-    cables = {cable.name: np.vstack([cable.anchor()[None], cable.guides()]).tolist() for cable in robot.cables}
-    cables |= {chamber.name: chamber.ends().tolist() for chamber in robot.chambers}
-    return {
-        "station": list(robot.body.station_m),
-        "half_width": np.asarray(robot.body.half_width_m).tolist(),
-        "cables": cables,
-        "markers": dict(zip(robot.marker_names, robot.marker_points().tolist(), strict=True)),
-        "gravity": robot.gravity.tolist(),
-    }
 
 
 def implausible(robot: Robot) -> str | None:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 
 from rfdropo_bayes.robots.body import Body, PointMass
-from rfdropo_bayes.robots.parameter import Positive, RobotTable
+from rfdropo_bayes.robots.table import Positive, RobotTable
 from rfdropo_bayes.tables import parse_table
 
 QUADRATURE_POINTS = 24

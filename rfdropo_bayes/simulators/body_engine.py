@@ -32,13 +32,14 @@ from rfdropo_bayes.fem import (
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.fem.dynamics import Prepared, State, System
 from rfdropo_bayes.fem.integrators import STAGES, Integrator
+from rfdropo_bayes.fem.mesh_points import NodePoints
 from rfdropo_bayes.fem.native.rod_engine import NativeRod
 from rfdropo_bayes.fem.native.tetrahedral_engine import TetrahedralEngine
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rigid_body import Cube, CubeState
 from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
-from rfdropo_bayes.fem.tetrahedra import NodePoints, TetrahedralMaterial, TetrahedralSystem
+from rfdropo_bayes.fem.tetrahedra import TetrahedralMaterial, TetrahedralSystem
 from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.finite_differences import (
     ACCELERATION,

@@ -17,13 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cable_drive import DriveLimits
+from rfdropo_bayes.fem.mesh_points import NodePoints, joined
 from rfdropo_bayes.fem.rod import Rod, profile_rod
 from rfdropo_bayes.fem.tetrahedra import (
-    NodePoints,
     TetrahedralBody,
     TetrahedralMaterial,
     TetrahedralSystem,
-    joined,
     locate,
     lumped_masses,
     mean_points,

@@ -20,8 +20,8 @@ from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import RecordingEntry, Trajectory, load_recordings, one_at_a_time
+from rfdropo_bayes.data.given_recordings import given_recording, given_recordings
 from rfdropo_bayes.data.sample_times import sample_time
-from rfdropo_bayes.data.unseen import given_recording, given_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import gather_groups, group_of, in_group, whole
 from rfdropo_bayes.inference.progress import Progress, say_step
@@ -51,7 +51,7 @@ from rfdropo_bayes.prediction.session_error import SESSION_ERROR, SessionError, 
 from rfdropo_bayes.prediction.session_fit import SessionFit, fit_session
 from rfdropo_bayes.report import BaselineErrors, build_summary
 from rfdropo_bayes.report.baselines import session_baselines
-from rfdropo_bayes.report.residuals import predictive_bands
+from rfdropo_bayes.report.coverage import predictive_bands
 from rfdropo_bayes.report.run_files import CONFIG, POSTERIOR
 from rfdropo_bayes.report.scores import MeasuredPath
 from rfdropo_bayes.results.calibrated import Calibration

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.cable import Cable, Chamber
+from rfdropo_bayes.robots.cable import Cable
+from rfdropo_bayes.robots.chamber import Chamber
 
 ITERATIONS = 30
 LOOKED, STILL = 5, 1e-2

@@ -25,9 +25,10 @@ from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
-from rfdropo_bayes.discrepancy.differences import Groups, OwnParameter, with_differences, with_fixed_quantities
+from rfdropo_bayes.discrepancy.differences import Groups, with_differences
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Rules
 from rfdropo_bayes.discrepancy.fit import widening
+from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter, with_fixed_quantities
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.law_words import law_tables
 from rfdropo_bayes.discrepancy.pipeline import Answer
@@ -51,7 +52,8 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import hashes, run_folder
 from rfdropo_bayes.report import software_versions
-from rfdropo_bayes.report.audit_page import render_audit, residual_dataset, shown
+from rfdropo_bayes.report.audit_page import render_audit, shown
+from rfdropo_bayes.report.residual_file import residual_dataset
 from rfdropo_bayes.report.run_files import SUMMARY
 from rfdropo_bayes.report.summary import combined_hash, read_summary
 from rfdropo_bayes.results.audited import Audit

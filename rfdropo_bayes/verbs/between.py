@@ -10,8 +10,9 @@ import numpy as np
 
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy.candidates import Candidate
-from rfdropo_bayes.discrepancy.differences import WHERE, Groups, OwnParameter
+from rfdropo_bayes.discrepancy.differences import WHERE, Groups
 from rfdropo_bayes.discrepancy.fit import widening
+from rfdropo_bayes.discrepancy.fixed_quantities import OwnParameter
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, gather_groups, group_of, in_group, whole

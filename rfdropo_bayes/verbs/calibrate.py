@@ -63,15 +63,16 @@ from rfdropo_bayes.report import (
     software_versions,
 )
 from rfdropo_bayes.report.baselines import with_fitted_commands
+from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
-from rfdropo_bayes.report.scores import score_objects
 from rfdropo_bayes.report.summary import read_summary
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.robots.robot import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
-from rfdropo_bayes.verbs.arguments import MOST_DRAWS, budget_within, given_model, rollout_seconds
+from rfdropo_bayes.verbs.arguments import given_model
+from rfdropo_bayes.verbs.budget import MOST_DRAWS, budget_within, rollout_seconds
 from rfdropo_bayes.verbs.left_out_sessions import (
     OPENINGS,
     Sessions,

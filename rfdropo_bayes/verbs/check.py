@@ -28,7 +28,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.model_spec import ModelSpec, Workpiece, find_robot, spec_of
 from rfdropo_bayes.model.robot_listings import robot_facts, simulator_facts
 from rfdropo_bayes.posteriors import central_interval
-from rfdropo_bayes.report.check_figures import rest_figure
+from rfdropo_bayes.report.rest_figure import rest_figure
 from rfdropo_bayes.report.trajectory_figures import save_recording
 from rfdropo_bayes.robots import Robot, Travel, robot_shape
 from rfdropo_bayes.robots.robot import implausible_values

@@ -30,7 +30,7 @@ from rfdropo_bayes.policies.evaluation import (
     success,
 )
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
-from rfdropo_bayes.policies.policy_page import save_animation, success_figure
+from rfdropo_bayes.policies.policy_figures import save_animation, success_figure
 from rfdropo_bayes.policies.randomisation import Randomisation
 from rfdropo_bayes.policies.rendering import frames_of
 from rfdropo_bayes.policies.tasks import Task, observed_of

@@ -37,7 +37,7 @@ from rfdropo_bayes.policies.tasks import Task, task_named
 from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.posteriors import PosteriorRecord
-from rfdropo_bayes.prediction.session_error import session_deviations
+from rfdropo_bayes.prediction.session_deviation import session_deviations
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import OBJECT, Robot

@@ -24,8 +24,8 @@ from rfdropo_bayes.data import (
     load_unseen,
     start_is_known,
 )
+from rfdropo_bayes.data.given_recordings import given_recording
 from rfdropo_bayes.data.sample_times import sample_time
-from rfdropo_bayes.data.unseen import given_recording
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.groups import Patterns, group_of, in_group
 from rfdropo_bayes.model.assembly import KNOWN, fixed_values, integrator_of, model_specs, with_groups

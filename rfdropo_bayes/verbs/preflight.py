@@ -20,8 +20,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 
+from rfdropo_bayes.bayes.batches import chunk_sizes
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
-from rfdropo_bayes.bayes.lanes import chunk_sizes
 from rfdropo_bayes.bayes.noise import LASTING_NOISE, NOISE_CORRELATION_TIME, OBSERVATION_NOISE
 from rfdropo_bayes.data import Trajectory, noise_floor
 from rfdropo_bayes.errors import InputError
@@ -31,7 +31,7 @@ from rfdropo_bayes.report.identifiability import DETERMINED, FREE, NEGLIGIBLE, W
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import changed
-from rfdropo_bayes.verbs.arguments import budget_within
+from rfdropo_bayes.verbs.budget import budget_within
 
 # Step of a derivative, in prior standard deviations. A quarter of the draws of the paper's trunk snap within 2e-3,
 # which hides the scale of its modulus and mass; 2e-4 and 2e-5 give the same slopes to five digits.

@@ -17,7 +17,8 @@ from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.data import Trajectory, group_repeats, shared_markers
 from rfdropo_bayes.model.assembly import build_model, build_simulator
 from rfdropo_bayes.model.model_spec import ModelSpec
-from rfdropo_bayes.report.baselines import fit_fir, mean_pose
+from rfdropo_bayes.report.baselines import mean_pose
+from rfdropo_bayes.report.fir import fit_fir
 from rfdropo_bayes.report.units import display_name
 from rfdropo_bayes.verbs.arrangement import Arrangement
 from rfdropo_bayes.verbs.at_rest import RestingRobot, Rows, resting, rows_of, spread_rows

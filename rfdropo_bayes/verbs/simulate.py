@@ -15,7 +15,7 @@ from jaxtyping import Float
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
 from rfdropo_bayes.bayes.recordings import commands_of
 from rfdropo_bayes.data import Measured, Origin, SentCommands, Trajectory, shared_markers
-from rfdropo_bayes.data.unseen import given_recordings
+from rfdropo_bayes.data.given_recordings import given_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import whole, write_json
 from rfdropo_bayes.model.assembly import AnySimulator, physical_values

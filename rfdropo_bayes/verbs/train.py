@@ -17,15 +17,17 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import command_of, run_folder
 from rfdropo_bayes.policies.episodes import Episodes
 from rfdropo_bayes.policies.evaluation import tension_sentence, without_end
-from rfdropo_bayes.policies.onnx_export import ExportedPolicy, difference, export_policy, latency, observations
-from rfdropo_bayes.policies.policy_page import EPISODES, curve_figure, play_policy, render_policy
+from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
+from rfdropo_bayes.policies.parity import difference, observations
+from rfdropo_bayes.policies.policy_figures import curve_figure
+from rfdropo_bayes.policies.policy_page import EPISODES, play_policy, render_policy
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training import train as learn
 from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
 from rfdropo_bayes.policies.vec_env import TrunkVecEnv
 from rfdropo_bayes.report import software_versions
+from rfdropo_bayes.report.facts import LEARNING
 from rfdropo_bayes.report.run_files import CONFIG
-from rfdropo_bayes.report.summary import LEARNING
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots.policy_layout import (
     EVALUATED_EPISODES,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rfdropo_bayes.bayes.lanes import is_batch, padded
+from rfdropo_bayes.bayes.batches import is_batch, padded
 
 
 @pytest.mark.parametrize("count", [0, 1, 8, 9, 130])

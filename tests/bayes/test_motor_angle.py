@@ -20,7 +20,7 @@ from rfdropo_bayes.bayes.recordings import gather_recordings
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import CsvColumns, Measured, Origin, SentCommands, Trajectory
-from rfdropo_bayes.data.counters import hold_time
+from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.mapped_formats import read_mapped
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods

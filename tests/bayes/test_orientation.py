@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.bayes.channels import Orientation, Seen
-from rfdropo_bayes.bayes.channels.object_pose import of_rotation_vector, product
+from rfdropo_bayes.bayes.channels.quaternions import of_rotation_vector, product
 from rfdropo_bayes.simulators.protocol import Observation
 from rfdropo_bayes.simulators.robot_simulator import orientations
 from studies.replicas import drawn

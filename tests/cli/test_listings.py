@@ -8,7 +8,7 @@ from typing import get_args
 import pytest
 
 from rfdropo_bayes.cli import main
-from rfdropo_bayes.data.mapped_formats import FORMATS
+from rfdropo_bayes.data.format_descriptions import FORMATS
 from rfdropo_bayes.data.spec import Format
 from rfdropo_bayes.inference.methods import METHODS
 from rfdropo_bayes.mechanisms.registry import REGISTRY

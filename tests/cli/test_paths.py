@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rfdropo_bayes.cli.audit_commands import _from_here
 from rfdropo_bayes.cli.options import experiment_name
+from rfdropo_bayes.cli.prediction_commands import _from_here
 
 
 def test_a_file_here_is_meant_before_one_beside_the_experiment(tmp_path, monkeypatch):

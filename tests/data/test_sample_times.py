@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from rfdropo_bayes.data import CsvColumns, Trajectory, find_faults
-from rfdropo_bayes.data.counters import hold_time
+from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.mapped_formats import read_mapped
 from rfdropo_bayes.data.sample_times import (
     check_times,

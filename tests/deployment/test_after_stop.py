@@ -10,8 +10,9 @@ import pytest
 from rfdropo_bayes.deployment.bench.simulated_node import SimulatedFault
 from rfdropo_bayes.deployment.causes import Cause
 from rfdropo_bayes.deployment.cia402 import DriveState
-from rfdropo_bayes.deployment.loop import AfterStop, ControlLoop
+from rfdropo_bayes.deployment.loop import ControlLoop
 from rfdropo_bayes.deployment.objects import Object
+from rfdropo_bayes.deployment.watch import AfterStop
 
 ENABLED, STOPPED = DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE
 DISABLED, FAULT = DriveState.SWITCH_ON_DISABLED, DriveState.FAULT

@@ -14,9 +14,9 @@ from rfdropo_bayes.deployment.causes import Stop
 from rfdropo_bayes.deployment.cia402 import DriveState, controlword_towards
 from rfdropo_bayes.deployment.clock import Tick
 from rfdropo_bayes.deployment.drives import Drives, Guards, Identity, Reading, drives_of
-from rfdropo_bayes.deployment.loop import Watch
 from rfdropo_bayes.deployment.objects import Object, first_axis, identifiers, of_axis
 from rfdropo_bayes.deployment.settings import SafetyTable
+from rfdropo_bayes.deployment.watch import Watch
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 

@@ -14,9 +14,9 @@ from rfdropo_bayes.deployment.causes import Stop
 from rfdropo_bayes.deployment.cia402 import Controlword, DriveState, controlword_towards
 from rfdropo_bayes.deployment.clock import Tick
 from rfdropo_bayes.deployment.drives import Drives, Guards, Identity, Reading
-from rfdropo_bayes.deployment.loop import Watch
 from rfdropo_bayes.deployment.objects import Object
 from rfdropo_bayes.deployment.settings import SafetyTable
+from rfdropo_bayes.deployment.watch import Watch
 from rfdropo_bayes.errors import InputError
 
 LONG = 0.5  # [s]: a loaded machine answers in time, too

@@ -18,11 +18,12 @@ from rfdropo_bayes.deployment.bench.hub import HubBus
 from rfdropo_bayes.deployment.bench.simulated_bus import SimulationTable, simulated_drives
 from rfdropo_bayes.deployment.bus import BusTable
 from rfdropo_bayes.deployment.causes import Cause
+from rfdropo_bayes.deployment.homing import Home, HomingResult, load_homing
 from rfdropo_bayes.deployment.log import read_journal, session_trajectory
 from rfdropo_bayes.deployment.loop import Phase
 from rfdropo_bayes.deployment.policy import OnnxPolicy, pulls_too_hard
 from rfdropo_bayes.deployment.sensors import SimulatedMarkers
-from rfdropo_bayes.deployment.session import Home, HomingResult, deploy, load_homing
+from rfdropo_bayes.deployment.session import deploy
 from rfdropo_bayes.deployment.settings import (
     Deployment,
     DrivesTable,

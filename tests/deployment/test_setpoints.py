@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rfdropo_bayes.deployment.loop import SetPoints
+from rfdropo_bayes.deployment.setpoints import SetPoints
 from rfdropo_bayes.robots import Motor, Robot
 
 PERIOD = 0.01

@@ -19,7 +19,8 @@ from rfdropo_bayes.discrepancy.audit_problem import AuditProblem
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
 from rfdropo_bayes.discrepancy.base_fit import first_target
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
-from rfdropo_bayes.discrepancy.differences import Groups, families, with_differences
+from rfdropo_bayes.discrepancy.differences import Groups, with_differences
+from rfdropo_bayes.discrepancy.fixed_quantities import families
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.pipeline import Answer, audit
 from rfdropo_bayes.errors import InputError

@@ -9,8 +9,8 @@ import pytest
 
 from rfdropo_bayes.bayes.noise.autoregression import STATED, Autoregression
 from rfdropo_bayes.discrepancy.held_out import BLOCKS, HELD_OUT_ROWS, blocks_of_rows, later_rows
+from rfdropo_bayes.discrepancy.omnibus import block_squares
 from rfdropo_bayes.discrepancy.remainder import describe_remainder
-from rfdropo_bayes.discrepancy.score_tests import block_squares
 
 from .toys import measurements
 

@@ -31,7 +31,8 @@ from rfdropo_bayes.discrepancy.port_responses import responses, under
 from rfdropo_bayes.discrepancy.port_rollouts import PortedForward, placed
 from rfdropo_bayes.mechanisms.features import Feature
 from rfdropo_bayes.mechanisms.ports import Port, port_map
-from rfdropo_bayes.report.audit_page import render_audit, residual_dataset, shown
+from rfdropo_bayes.report.audit_page import render_audit, shown
+from rfdropo_bayes.report.residual_file import residual_dataset
 from rfdropo_bayes.verbs.design import _with_laws
 
 from .toys import STEP, Toy, problem, recordings

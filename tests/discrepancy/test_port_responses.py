@@ -20,15 +20,8 @@ from rfdropo_bayes.discrepancy.law_search import (
     fresh_terms,
     leading_terms,
 )
-from rfdropo_bayes.discrepancy.port_responses import (
-    MEMORIES,
-    SIZES,
-    Responses,
-    evidences,
-    feature_columns,
-    on_splines,
-    splines,
-)
+from rfdropo_bayes.discrepancy.port_evidence import MEMORIES, SIZES, evidences
+from rfdropo_bayes.discrepancy.port_responses import Responses, feature_columns, on_splines, splines
 from rfdropo_bayes.discrepancy.port_rollouts import PlacedTerm, Scope, coefficient_name, placed
 from rfdropo_bayes.discrepancy.verdict import SMALL, negligible
 from rfdropo_bayes.mechanisms.features import OWN, Feature

@@ -11,9 +11,9 @@ import xarray as xr
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy.audit_record import next_experiment, record
-from rfdropo_bayes.discrepancy.differences import with_fixed_quantities
+from rfdropo_bayes.discrepancy.fixed_quantities import with_fixed_quantities
+from rfdropo_bayes.discrepancy.omnibus import BLOCK
 from rfdropo_bayes.discrepancy.pipeline import Answer, audit
-from rfdropo_bayes.discrepancy.score_tests import BLOCK
 from rfdropo_bayes.report.audit_page import shown
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.parameters import specs_of

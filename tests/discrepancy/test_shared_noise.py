@@ -7,8 +7,9 @@ from rfdropo_bayes.bayes.noise.autoregression import REPEATS, STATED, Autoregres
 from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.bayes.repeat_noise import repeat_shift
 from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.omnibus import statistics
 from rfdropo_bayes.discrepancy.score import project_out, span
-from rfdropo_bayes.discrepancy.score_tests import null_residuals, statistics, tail
+from rfdropo_bayes.discrepancy.score_tests import null_residuals, tail
 
 from .toys import measurements
 

@@ -32,6 +32,7 @@ from rfdropo_bayes.discrepancy.gain import (
     explained_fraction,
     sign_flip_p,
 )
+from rfdropo_bayes.discrepancy.omnibus import joint_test, statistics
 from rfdropo_bayes.discrepancy.score import (
     Signature,
     joint_statistic,
@@ -41,7 +42,7 @@ from rfdropo_bayes.discrepancy.score import (
     span,
     statistic,
 )
-from rfdropo_bayes.discrepancy.score_tests import joint_test, null_residuals, statistics, tail
+from rfdropo_bayes.discrepancy.score_tests import null_residuals, tail
 from rfdropo_bayes.discrepancy.verdict import decide
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 

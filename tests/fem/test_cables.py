@@ -14,7 +14,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cables import courses, lengths, rest_lengths, routes, station_rows, threads
 from rfdropo_bayes.fem.components import rotation, turned
 from rfdropo_bayes.fem.constraints import CABLE_SOFTNESS, solve_constraints
-from rfdropo_bayes.fem.stage_solve import laned, settle_cables
+from rfdropo_bayes.fem.lanes import laned
+from rfdropo_bayes.fem.stage_solve import settle_cables
 
 solve_tensions = jax.jit(lambda compliance, slack, start: solve_constraints(compliance, slack, start, 1.0))
 

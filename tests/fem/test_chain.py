@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes import fem  # noqa: F401  (double precision)
+from rfdropo_bayes.fem.lanes import laned
 from rfdropo_bayes.fem.rod_elements import Stiffness
-from rfdropo_bayes.fem.stage_solve import Chain, ascend, descend, eliminate, laned
+from rfdropo_bayes.fem.stage_solve import Chain, ascend, descend, eliminate
 
 STATIONS, ROWS = 4, 2
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.inference.modes.optimisation import Laplace
-from rfdropo_bayes.inference.modes.reweighting import integrate_scales
+from rfdropo_bayes.inference.modes.scales import integrate_scales
 
 GROUPS, KINDS, SIGMA, WIDTH = 4, 3, 0.3, 2.0
 

@@ -16,7 +16,7 @@ from rfdropo_bayes.model.experiment_file import describe, read_tables
 from rfdropo_bayes.model.fitted_integrator import INTEGRATOR, check_fitted_integrator
 from rfdropo_bayes.model.model_spec import ModelSpec
 from rfdropo_bayes.model.run_folder import CONFIG, run_folder
-from rfdropo_bayes.policies.episodes import trunk_simulator
+from rfdropo_bayes.policies.building import trunk_simulator
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
 from rfdropo_bayes.report.run_files import POSTERIOR
 from rfdropo_bayes.results.calibrated import Calibration

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_sb3
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.policies.episodes import make_episodes
+from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.gym_env import TrunkEnv
 from rfdropo_bayes.policies.randomisation import (
     Draws,

@@ -14,8 +14,10 @@ from stable_baselines3.common.vec_env import VecNormalize
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies import onnx_export
 from rfdropo_bayes.policies import training as run
-from rfdropo_bayes.policies.onnx_export import ExportedPolicy, check_exportable, difference, export_policy, observations
-from rfdropo_bayes.policies.training import Trained, ppo_options, train
+from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy
+from rfdropo_bayes.policies.parity import check_exportable, difference, observations
+from rfdropo_bayes.policies.ppo import ppo_options
+from rfdropo_bayes.policies.training import Trained, train
 from rfdropo_bayes.policies.training_config import TrainingTable
 from tests.policies.toys import Points, layout
 

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.policies.evaluation import Case, Episode
-from rfdropo_bayes.policies.policy_page import Played, draws_figure, next_steps, render_policy
+from rfdropo_bayes.policies.policy_figures import draws_figure
+from rfdropo_bayes.policies.policy_page import Played, next_steps, render_policy
 from rfdropo_bayes.report.style import embed
 
 BROWSER = next(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.policies.episodes import make_episodes
+from rfdropo_bayes.policies.building import make_episodes
 from rfdropo_bayes.policies.evaluation import Case, Episode, peak_tension, play, success, tension_sentence
 from rfdropo_bayes.policies.gym_env import TrunkEnv
 from rfdropo_bayes.policies.tasks import EPISODE, FLOOR, PERIOD

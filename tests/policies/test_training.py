@@ -26,7 +26,8 @@ from rfdropo_bayes.policies.evaluation import (
     success,
 )
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, latency
-from rfdropo_bayes.policies.training import ppo_options, train
+from rfdropo_bayes.policies.ppo import ppo_options
+from rfdropo_bayes.policies.training import train
 from rfdropo_bayes.policies.training_config import TrainingTable
 from tests.policies.toys import STEP, Points, layout
 

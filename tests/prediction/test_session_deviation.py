@@ -10,7 +10,7 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.policies.randomisation import fitting
 from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, Scope
 from rfdropo_bayes.prediction.model_error import ADAPTED_TO
-from rfdropo_bayes.prediction.session_error import session_deviations
+from rfdropo_bayes.prediction.session_deviation import session_deviations
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
 

@@ -13,7 +13,8 @@ import pytest
 from rfdropo_bayes.data import DataSpec, Measured, Origin, SentCommands, Trajectory, command_openings, load_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.report import BaselineErrors, baseline_errors
-from rfdropo_bayes.report.baselines import Predictor, fit_fir, held_pose, mean_pose, repeated_mean, with_fitted_commands
+from rfdropo_bayes.report.baselines import Predictor, held_pose, mean_pose, repeated_mean, with_fitted_commands
+from rfdropo_bayes.report.fir import fit_fir
 from rfdropo_bayes.report.scores import measured_paths
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from rfdropo_bayes.posteriors import RecordingPrediction
-from rfdropo_bayes.report.residuals import coverage, predictive_bands, probability_transform, transform_curve
+from rfdropo_bayes.report.coverage import coverage, predictive_bands, probability_transform, transform_curve
 
 
 def gaussian(spread: float, *, rows: int = 4000, draws: int = 400, memory: float = 0.0) -> RecordingPrediction:

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.report.scores import energy_score, final_position
+from rfdropo_bayes.report.object_scores import energy_score, final_position
 
 
 @pytest.mark.parametrize("outcome", [-2.0, 0.0, 0.7])

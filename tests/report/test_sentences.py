@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rfdropo_bayes.cli.terminal_summary import show_audit
-from rfdropo_bayes.report.units import sentences
+from rfdropo_bayes.report.sentences import sentences
 
 REPORTS = Path(__file__).resolve().parents[2] / "reports"
 SAID = "Lag of 0.05 s (p < 0.001) explains [simulator] u_own. Look at guide No.3 of arm.toml. The time was up."

@@ -7,7 +7,7 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.robots.robot import robot_shape
+from rfdropo_bayes.robots.shape import robot_shape
 
 ARM = Robot.load("smooth_arm")
 LIMITS = {"displacement_limit_m": None, "drive": "tension", "tension_limit_n": (0.0, 5.0)}

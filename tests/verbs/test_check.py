@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from rfdropo_bayes.cli.audit_commands import ending
+from rfdropo_bayes.cli.check_command import ending
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.named_columns import METRES, CsvColumns, axes_matrix
 from rfdropo_bayes.errors import InputError

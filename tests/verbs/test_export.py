@@ -10,8 +10,9 @@ import pytest
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import FIXED, ParameterInfo, PosteriorRecord
+from rfdropo_bayes.report.facts import RunFacts
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
-from rfdropo_bayes.report.summary import RunFacts, build_summary, write_summary
+from rfdropo_bayes.report.summary import build_summary, write_summary
 from rfdropo_bayes.verbs.export import export_model, export_phi, millimetre_factor
 
 

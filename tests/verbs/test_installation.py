@@ -11,7 +11,7 @@ from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.model.experiment_file import describe
 from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.robots import Robot
-from rfdropo_bayes.verbs.arguments import FEWEST_DRAWS, FEWEST_ROLLOUTS, MOST_DRAWS, budget_within
+from rfdropo_bayes.verbs.budget import FEWEST_DRAWS, FEWEST_ROLLOUTS, MOST_DRAWS, budget_within
 from rfdropo_bayes.verbs.calibrate import _budgeted
 from rfdropo_bayes.verbs.installation import ORIGIN, ZERO, installed_mechanisms, installed_priors, largest_pull
 

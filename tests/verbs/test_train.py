@@ -15,7 +15,7 @@ import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy
-from rfdropo_bayes.policies.policy_page import curve_figure
+from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.randomisation import fitting
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training_config import TrainingTable

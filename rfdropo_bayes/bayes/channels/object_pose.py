@@ -6,8 +6,6 @@ Model errors of a push are correlated in time, since a body at rest keeps its po
 process (`bayes.noise`) with its own sizes and its own correlation time. If the noise of the positions is white, this
 noise is also white, and `inference.modes.lasting` weights the rows: noise that lasts for the whole recording would also
 absorb a wrong push.
-
-Rotations as unit quaternions (x, y, z, w).
 """
 
 from __future__ import annotations
@@ -22,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from rfdropo_bayes.bayes.channels.channel import Seen, Series
+from rfdropo_bayes.bayes.channels.quaternions import inverse, product, turn_between
 from rfdropo_bayes.bayes.noise import Autoregression, Noise, Timeline, draw_noise, timeline, whiten
 from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.data import Trajectory
@@ -252,33 +251,3 @@ def object_error(
 
 def _turn_since_start(q: Float[Any, "recording time 4"]) -> Float[Any, "recording time 4"]:
     return product(q, inverse(q[:, :1]))
-
-
-def inverse(q: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
-    """The rotation back."""
-    return q * jnp.array([-1.0, -1.0, -1.0, 1.0])
-
-
-def product(a: Float[Array, "... 4"], b: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
-    """First b, then a."""
-    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + jnp.cross(a[..., :3], b[..., :3])
-    scalar = a[..., 3] * b[..., 3] - jnp.sum(a[..., :3] * b[..., :3], axis=-1)
-    return jnp.concatenate([vector, scalar[..., None]], axis=-1)
-
-
-def turn_between(first: Float[Any, "... 4"], second: Float[Any, "... 4"]) -> Float[Any, "... 3"]:
-    """Twice the vector of the quaternion from one turn to another: the rotation vector [rad] for small turns, without a
-    singularity for large turns.
-    """
-    between = product(second, inverse(first))
-    return 2.0 * jnp.where(between[..., 3:] < 0.0, -1.0, 1.0) * between[..., :3]
-
-
-def of_rotation_vector(turn: Float[Array, "... 3"]) -> Float[Array, "... 4"]:
-    """The rotation by a vector [rad]; smooth at zero."""
-    square = jnp.sum(turn**2, axis=-1, keepdims=True)
-    small = square < 1e-8
-    half = 0.5 * jnp.sqrt(jnp.where(small, 1.0, square))
-    share = jnp.where(small, 0.5 - square / 48.0, 0.5 * jnp.sin(half) / half)
-    cosine = jnp.where(small, 1.0 - square / 8.0, jnp.cos(half))
-    return jnp.concatenate([share * turn, cosine], axis=-1)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.bayes.channels.channel import Seen, WhiteSeries
-from rfdropo_bayes.bayes.channels.object_pose import of_rotation_vector, product, turn_between
+from rfdropo_bayes.bayes.channels.quaternions import of_rotation_vector, product, turn_between
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.simulators.parameters import ParameterSpec

@@ -30,8 +30,8 @@ from rfdropo_bayes.fem.native.contact_records import (
     touch_storage,
 )
 from rfdropo_bayes.fem.native.effect_rows import effect_flags, effect_rows, law_rows, load_rows
-from rfdropo_bayes.fem.native.fields import in_blocks
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
+from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.rod_effects import LOADED
 from rfdropo_bayes.fem.native.rod_records import (

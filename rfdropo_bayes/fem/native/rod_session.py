@@ -19,7 +19,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.dynamics import Material
 from rfdropo_bayes.fem.native.contact_records import Cubes
 from rfdropo_bayes.fem.native.effect_rows import load_rows
-from rfdropo_bayes.fem.native.fields import in_blocks
+from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.rod_effects import LOADED
 from rfdropo_bayes.fem.native.rod_engine import NativeRod, Records, Run
 from rfdropo_bayes.fem.native.rod_records import RodSamples

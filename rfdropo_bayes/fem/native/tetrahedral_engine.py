@@ -13,6 +13,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cable_drive import DriveLimits
 from rfdropo_bayes.fem.dynamics import LOST
 from rfdropo_bayes.fem.integrators import Integrator, timed_stages
+from rfdropo_bayes.fem.mesh_points import NodeCables, NodePoints, routes
 from rfdropo_bayes.fem.native import tetrahedral_rollout as kernels
 from rfdropo_bayes.fem.native.block_cholesky import BlockPattern, analyse, block_slot, elimination_order
 from rfdropo_bayes.fem.native.constraint_problem import SETTLED, SOFTNESS, ConstraintProblem, problem_storage
@@ -24,14 +25,14 @@ from rfdropo_bayes.fem.native.contact_records import (
     pairs_of,
     touch_storage,
 )
-from rfdropo_bayes.fem.native.fields import in_blocks
 from rfdropo_bayes.fem.native.kernel_cache import kernel_sources
+from rfdropo_bayes.fem.native.lane_blocks import in_blocks
 from rfdropo_bayes.fem.native.rod_constraints import Rows, row_storage
 from rfdropo_bayes.fem.native.simd import aligned_zeros, lane_token, native_lanes
 from rfdropo_bayes.fem.native.tetrahedral import Mesh, TetrahedralSamples, TetrahedralWork
 from rfdropo_bayes.fem.pushing import PushGeometry
 from rfdropo_bayes.fem.rollouts import Motion
-from rfdropo_bayes.fem.tetrahedra import POISSON_LIMIT, NodeCables, NodePoints, TetrahedralBody, routes
+from rfdropo_bayes.fem.tetrahedra import POISSON_LIMIT, TetrahedralBody
 from rfdropo_bayes.runtime import available_processors
 
 

@@ -32,6 +32,7 @@ from rfdropo_bayes.errors import InputError, NoLikelihoodError
 from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.modes.lasting import CountedProblem, Lasting, lasting_cautions, lasting_residuals
+from rfdropo_bayes.inference.modes.mixture import alternatives, draw_mixture, mixture_cautions, shares
 from rfdropo_bayes.inference.modes.optimisation import (
     Laplace,
     LevenbergState,
@@ -41,17 +42,8 @@ from rfdropo_bayes.inference.modes.optimisation import (
     normal_at,
     optimisation_cost,
 )
-from rfdropo_bayes.inference.modes.reweighting import (
-    CANDIDATE_SHARE,
-    Reweighted,
-    alternatives,
-    draw_mixture,
-    integrate_scales,
-    mixture_cautions,
-    reweighted,
-    reweighting_cautions,
-    shares,
-)
+from rfdropo_bayes.inference.modes.reweighting import CANDIDATE_SHARE, Reweighted, reweighted, reweighting_cautions
+from rfdropo_bayes.inference.modes.scales import integrate_scales
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.progress import UNRECORDED, UNSAVED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import Draws, InferenceResult, chains, exclusion_cautions, prior_cautions

@@ -5,15 +5,6 @@ phi holds a mean and a standard deviation per parameter; it maximises the likeli
 unless ``mended = false``: the horizon ends at the last row; the finalists (the best of every stage) are scored again at
 the FULL horizon with common random numbers, because losses at different horizons cannot be compared; and measurements
 have noise, whose variance is added to the rollouts' so that phi need not explain it.
-
-Score of a trajectory under a distribution.
-
-Eq. 2 and 3 of RF-DROPO: at every time step a Gaussian with the mean and covariance of rollouts drawn from it.
-
-Search space of RF-DROPO: independent truncated normals over simulator parameters, each coded by a vector.
-
-Vectors lie in [0, 4]^k, as the optimisers want them. Draws transform given uniform numbers, so that several vectors
-share their random numbers.
 """
 
 from __future__ import annotations
@@ -26,117 +17,18 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray
-from scipy.special import ndtr, ndtri
-from scipy.stats import qmc
+from jaxtyping import Float, PRNGKeyArray
 
-from rfdropo_bayes.bayes.problem import Problem, RolloutProblem, Values, with_rollouts
-from rfdropo_bayes.cautions import Caution, Code
+from rfdropo_bayes.bayes.problem import Problem, RolloutProblem, with_rollouts
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.method_options import MethodOptions
 from rfdropo_bayes.inference.progress import UNRECORDED, Checkpoint, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult, exclusion_cautions
+from rfdropo_bayes.inference.rfdropo.candidate_scores import ScorePlan, motion_scale, row_scores, simulate, uniforms
+from rfdropo_bayes.inference.rfdropo.phi_space import WIDTH, search_space
 from rfdropo_bayes.inference.smc.moves import host_generator
-
-WIDTH = 4.0  # every parameter's search range is scaled to [0, 4]
-SMALLEST_STD = 1e-5  # in these units
-LARGEST_STD = WIDTH / 4.0
-TRUNCATION = 2.0  # standard deviations
-
-
-class SearchSpace(NamedTuple):
-    """Parameters that are searched, with range and hard bounds in physical units.
-
-    A *vector* is (means, log standard deviations), each scaled to [0, 4].
-    """
-
-    names: tuple[str, ...]
-    low: Float[np.ndarray, " d"]
-    high: Float[np.ndarray, " d"]
-    hard_low: Float[np.ndarray, " d"]
-    hard_high: Float[np.ndarray, " d"]
-
-    @property
-    def dimension(self) -> int:
-        """Length of a vector."""
-        return 2 * len(self.names)
-
-    def unpack(self, vector: Float[np.ndarray, "*batch k"]) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation (before truncation), physical units, each (*batch, d)."""
-        d = len(self.names)
-        unit = (self.high - self.low) / WIDTH
-        logs = np.log(SMALLEST_STD) + vector[..., d:] / WIDTH * np.log(LARGEST_STD / SMALLEST_STD)
-        return self.low + vector[..., :d] * unit, np.exp(logs) * unit
-
-    def draw(self, vector: Float[np.ndarray, "*batch k"], uniform: Float[np.ndarray, "m d"]) -> np.ndarray:
-        """Draws (*batch, m, d) of the truncated normals at given uniform numbers.
-
-        Truncated at 2 standard deviations AND at the hard bounds, exactly, through the inverse distribution function.
-        One set of uniform numbers for several vectors gives them common random numbers.
-        """
-        mean, std = self.unpack(vector)
-        lower = ndtr(np.clip((self.hard_low - mean) / std, -TRUNCATION, TRUNCATION))
-        upper = ndtr(np.clip((self.hard_high - mean) / std, -TRUNCATION, TRUNCATION))
-        share = lower[..., None, :] + uniform * (upper - lower)[..., None, :]
-        drawn = mean[..., None, :] + std[..., None, :] * ndtri(share)
-        return np.clip(drawn, self.hard_low, self.hard_high)  # rounding only
-
-    def describe(self, vector: Float[np.ndarray, " k"], units: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-        """The distribution as a table: mean, std (before truncation), truncation limits and unit of each parameter."""
-        mean, std = self.unpack(vector)
-        low = np.maximum(mean - TRUNCATION * std, self.hard_low)
-        high = np.minimum(mean + TRUNCATION * std, self.hard_high)
-        return {
-            name: {
-                "mean": float(mean[j]),
-                "std": float(std[j]),
-                "low": float(low[j]),
-                "high": float(high[j]),
-                "unit": units[name],
-            }
-            for j, name in enumerate(self.names)
-        }
-
-    def edge_cautions(self, vector: Float[np.ndarray, " k"]) -> list[Caution]:
-        """A caution for every mean or standard deviation within a hundredth of its range from an end of it."""
-        d, cautions = len(self.names), []
-        for j, name in enumerate(self.names):
-            for what, value in (("mean", vector[j]), ("standard deviation", vector[d + j])):
-                side = "lower" if value < 0.01 * WIDTH else "upper" if value > 0.99 * WIDTH else None
-                if side and not (what == "standard deviation" and side == "lower"):
-                    sentence = f"the {what} of {name} sits on the {side} end of its search range"
-                    cautions.append(Caution(Code.SEARCH_EDGE, sentence))
-                elif side:
-                    sentence = (
-                        f"the standard deviation of {name} sits on its smallest value: the data do not ask for any "
-                        "spread, which one trajectory never does"
-                    )
-                    cautions.append(Caution(Code.NO_SPREAD, sentence, grave=True))
-        return cautions
-
-
-class ScorePlan(NamedTuple):
-    """Sizes fixed at the start."""
-
-    space: SearchSpace  # search space
-    population: int  # candidates per generation
-    horizons: tuple[int, ...]  # horizon of every generation, in rows
-    finalists: int  # number of candidates scored again
-    fixed: dict[str, float]  # values of fixed parameters
-    scale: float  # unit of the features [unit of the problem's features]
-    floor: Float[np.ndarray, " f"]  # added to the variance of each feature, in squares of that unit
-
-
-class CandidateRollouts(NamedTuple):
-    """Rollouts of some candidates, features in units of the motion."""
-
-    values: Float[np.ndarray, "c m d"]
-    features: Float[np.ndarray, "c m time f"]
-    alive: Bool[np.ndarray, "c m"]
-
 
 OPTIMISERS = ("cma", "cem")
 STEP = 0.3  # initial step of an optimiser, as a share of the search range
@@ -499,126 +391,3 @@ Optimiser = CrossEntropy | CovarianceAdaptation
 """Minimises a noisy loss over a box: `ask` for the candidates of a generation, `tell` their losses (infinite losses
 rank last), and `centre` of the search distribution.
 """
-
-
-def uniforms(key: PRNGKeyArray, m: int, d: int, *, stratified: bool) -> Float[np.ndarray, "m d"]:
-    """Uniform numbers that all candidates of a generation share; stratified numbers (Latin hypercube) scatter less."""
-    generator = host_generator(key)
-    return qmc.LatinHypercube(d, rng=generator).random(m) if stratified else generator.uniform(size=(m, d))
-
-
-def simulate(
-    problem: RolloutProblem,
-    plan: ScorePlan,
-    candidates: Float[np.ndarray, "c k"],
-    uniform: Float[np.ndarray, "m u"],
-    simulated: int,
-    ledger: Ledger,
-) -> CandidateRollouts:
-    """Roll candidates out; candidates times rollouts go to the problem as ONE batch."""
-    drawn = plan.space.draw(candidates, uniform)
-    c, m, _ = drawn.shape
-    values = {name: jnp.full(c * m, value) for name, value in plan.fixed.items()}
-    values |= {name: jnp.asarray(drawn[..., j].ravel()) for j, name in enumerate(plan.space.names)}
-    features, status = (np.asarray(part) for part in problem.rollouts(values, simulated))
-    ledger.charge(problem, c * m, simulated)
-    features = features.astype(float) / plan.scale
-    not_a_number = np.logical_not(np.isfinite(features).all(axis=(1, 2)))
-    ledger.exclude(problem, status, not_a_number)
-    alive = ((status == 0) & ~not_a_number).reshape(c, m)
-    return CandidateRollouts(drawn, features.reshape(c, m, *features.shape[1:]), alive)
-
-
-def row_scores(
-    problem: RolloutProblem, plan: ScorePlan, rollouts: CandidateRollouts, horizon: int
-) -> Float[np.ndarray, "c horizon"]:
-    """Log likelihood (eq. 3) of each row under every candidate; minus infinity if half of its rollouts failed."""
-    mask = np.asarray(problem.observed_mask)[:horizon]
-    observed = np.where(mask, np.asarray(problem.observed, dtype=float)[:horizon], 0.0) / plan.scale
-    c, m = rollouts.alive.shape
-    rows = np.full((c, horizon), -np.inf)
-    for index in range(c):
-        if rollouts.alive[index].sum() >= max(2, m / 2):
-            features = rollouts.features[index, :, :horizon]
-            rows[index] = step_log_likelihood(features, rollouts.alive[index], observed, mask, plan.floor)
-    return rows
-
-
-def step_log_likelihood(
-    features: Float[np.ndarray, "m time f"],
-    alive: Bool[np.ndarray, " m"],
-    observed: Float[np.ndarray, "time f"],
-    mask: Bool[np.ndarray, "time f"],
-    variance_floor: float | Float[np.ndarray, " f"],
-) -> Float[np.ndarray, " time"]:
-    """Log density of each observed time step under the Gaussian of the Monte-Carlo rollouts.
-
-    Mean and covariance are taken over the live rollouts. ``variance_floor`` is added to the variances; without it the
-    density is unbounded as the spread goes to zero.
-
-    Args:
-        features: rollouts of ONE parameter distribution.
-        alive: rollouts that succeeded; at least two.
-        observed: the trajectory, in the units of the features.
-        mask: observed entries that count.
-        variance_floor: floor of the variance in squared units of the features; a scalar, or one value per feature.
-    """
-    good = features[alive]
-    mean = good.mean(axis=0)
-    deviation = np.where(mask, good - mean, 0.0)
-    covariance = np.einsum("mtf,mtg->tfg", deviation / (len(good) - 1), deviation, optimize=True)
-    f = observed.shape[1]
-    # A masked entry becomes an independent unit normal at its mean: it adds nothing but a constant, left out below.
-    covariance[:, np.arange(f), np.arange(f)] += np.where(mask, variance_floor, 1.0)
-    factor = np.linalg.cholesky(covariance)
-    residual = np.where(mask, observed - mean, 0.0)
-    white = np.linalg.solve(factor, residual[..., None])[..., 0]
-    log_determinant = np.log(factor[:, np.arange(f), np.arange(f)]).sum(axis=1)
-    return -0.5 * np.sum(white**2, axis=1) - log_determinant - 0.5 * np.log(2.0 * np.pi) * mask.sum(axis=1)
-
-
-def motion_scale(observed: Float[np.ndarray, "time f"], mask: Bool[np.ndarray, "time f"]) -> float:
-    """Root mean square motion of the observed features from their first observed values, the unit of the match.
-
-    In this unit the paper's variance floor of 1e-5 is a deviation of 0.3 % of the motion, for a robot of any size.
-    """
-    squares: list[np.ndarray] = []
-    for column, valid in zip(observed.T, mask.T, strict=True):
-        seen = column[valid]
-        if len(seen):
-            squares.append((seen - seen[0]) ** 2)
-    total = np.sqrt(np.mean(np.concatenate(squares))) if squares else 0.0
-    return float(total) if total > 0.0 else 1.0
-
-
-def search_space(
-    problem: Problem, names: tuple[str, ...], ranges: Mapping[str, tuple[float, float]], prior: Values
-) -> SearchSpace:
-    """Search ranges: the given ranges, else the central 99 % of the prior, which lie inside the bounds, like the
-    paper's.
-
-    Hard bounds exclude impossible values and span decades; a search range is linear and needs narrower bounds.
-
-    Raises:
-        InputError: an unknown parameter, or a range that is empty or outside the bounds.
-    """
-    for name in (*names, *ranges):
-        if name not in problem.names:
-            raise InputError(
-                f"unknown parameter {name!r}", where="[inference]", remedy=f"use one of {', '.join(problem.names)}"
-            )
-    bounds = np.array([problem.bounds[name] for name in names], dtype=float)
-    chosen = []
-    for name, (low, high) in zip(names, bounds, strict=True):
-        if name in ranges:
-            chosen.append(tuple(ranges[name]))
-        else:
-            quantiles = np.quantile(np.asarray(prior[name]), [0.005, 0.995])
-            chosen.append((max(float(quantiles[0]), low), min(float(quantiles[1]), high)))
-        if not (low <= chosen[-1][0] < chosen[-1][1] <= high):
-            raise InputError(
-                f"the search range {chosen[-1]} of {name} is empty or leaves its bounds [{low:g}, {high:g}]",
-                where="[inference] search",
-            )
-    ranges_array = np.array(chosen, dtype=float)
-    return SearchSpace(tuple(names), ranges_array[:, 0], ranges_array[:, 1], bounds[:, 0], bounds[:, 1])

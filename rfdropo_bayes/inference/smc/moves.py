@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from scipy.linalg import solve_triangular
 
-from rfdropo_bayes.bayes.lanes import padded
+from rfdropo_bayes.bayes.batches import padded
 from rfdropo_bayes.bayes.problem import ProblemDefaults, ResidualProblem, Values
 from rfdropo_bayes.inference.modes.optimisation import Laplace
 

@@ -35,7 +35,8 @@ from rfdropo_bayes.simulators.adapters.mujoco_elements import (
     parameter_of,
     searched,
 )
-from rfdropo_bayes.simulators.adapters.mujoco_file import adapter_tables, model_text
+from rfdropo_bayes.simulators.adapters.mujoco_file import model_text
+from rfdropo_bayes.simulators.adapters.mujoco_start import adapter_tables
 from rfdropo_bayes.simulators.black_box import BlackBox
 from rfdropo_bayes.simulators.body_lanes import LaneStart
 from rfdropo_bayes.tables import nearest

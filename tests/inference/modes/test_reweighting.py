@@ -8,8 +8,9 @@ import pytest
 
 from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.inference.evaluations import Ledger
+from rfdropo_bayes.inference.modes.mixture import draw_mixture
 from rfdropo_bayes.inference.modes.optimisation import Laplace
-from rfdropo_bayes.inference.modes.reweighting import FIRST, Reweighted, draw_mixture, reweighted, reweighting_cautions
+from rfdropo_bayes.inference.modes.reweighting import FIRST, Reweighted, reweighted, reweighting_cautions
 
 from ..toys import LinearGaussian
 

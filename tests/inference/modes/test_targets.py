@@ -10,9 +10,10 @@ from rfdropo_bayes.cautions import Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.modes import mode_search as laplace
+from rfdropo_bayes.inference.modes.mixture import alternatives, draw_mixture
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.modes.optimisation import FLAT_STEPS, Laplace, maximise
-from rfdropo_bayes.inference.modes.reweighting import FIRST, alternatives, draw_mixture
+from rfdropo_bayes.inference.modes.reweighting import FIRST
 from rfdropo_bayes.inference.modes.targets import Target, make_target, prior_derivatives
 from rfdropo_bayes.inference.smc import bridge, sampler
 from rfdropo_bayes.inference.smc.sampler import SmcConfig

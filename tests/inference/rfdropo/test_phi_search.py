@@ -9,14 +9,9 @@ from scipy.stats import multivariate_normal
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference.rfdropo import phi_search as rfdropo
-from rfdropo_bayes.inference.rfdropo.phi_search import (
-    RfdropoConfig,
-    default_population,
-    make_optimiser,
-    motion_scale,
-    search_space,
-    step_log_likelihood,
-)
+from rfdropo_bayes.inference.rfdropo.candidate_scores import motion_scale, step_log_likelihood
+from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig, default_population, make_optimiser
+from rfdropo_bayes.inference.rfdropo.phi_space import search_space
 
 from ..toys import Spring
 
