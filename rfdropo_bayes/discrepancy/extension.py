@@ -17,6 +17,7 @@ from rfdropo_bayes.discrepancy.inadequacy import as_measured, misspecified
 from rfdropo_bayes.discrepancy.omnibus import Omnibus
 from rfdropo_bayes.discrepancy.score import likeness, project_out, signature, span
 from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests, run_score_tests
+from rfdropo_bayes.discrepancy.unknown_size import scale_gain
 
 DISCRETISATION = "discretisation"
 SHARES = np.array([1.0, 0.5, 0.2, 0.05])
@@ -25,9 +26,6 @@ SCANNED = tuple((k + 0.5) / 32 for k in range(32))
 70 ms under a noise of 0.3 mm is 8 ms wide; 32 quantiles are 5 ms apart there, 16 would be 9 ms.
 """
 TOLD_APART = 10.0  # nats: a refitted candidate that is worse by this difference is excluded from the class of the best
-# Nats of evidence that a parameter which the data fix costs under a prior twice as wide. Widths are chosen by hand: a
-# family of many parameters must not owe its place to that choice.
-WIDER = float(np.log(2.0))
 
 
 @dataclass(frozen=True)
@@ -109,10 +107,6 @@ class Refits:
         """The trials with one more fit, or with a better fit of a candidate."""
         waiting = tuple(each for each in self.waiting if each != name)
         return replace(self, fits={**self.fits, name: fit}, waiting=waiting)
-
-    def gains(self, before: Fit) -> dict[str, float]:
-        """Log Bayes factor of each candidate against the model before."""
-        return {name: fit.log_evidence - before.log_evidence for name, fit in self.fits.items()}
 
 
 @dataclass(frozen=True)
@@ -233,7 +227,7 @@ class ExtensionSearch:
             significant = [row for row in significant if row.name != DISCRETISATION]
         leads = {row.name: self._lead(tests.fit, row) for row in significant}
         drops = {name: drop for name, (drop, _) in leads.items()}
-        leading = self._leading(significant, drops, tests.fit)
+        leading = self._leading(significant, drops)
         if leading:
             count = len(leading) * optimisation_rollouts(self.target, len(tests.fit.free) + 1)
             seconds = count * self.target.forward.pace
@@ -242,7 +236,7 @@ class ExtensionSearch:
         yield tried
         for row in leading:
             tried = tried.with_fit(row.name, self._refit(tests.fit, row, leads[row.name][1]))
-            self.report(f"refit with {row.name}: log Bayes factor {tried.gains(tests.fit)[row.name]:.1f}")
+            self.report(f"refit with {row.name}: log Bayes factor {self.gain(tests.fit, tried.fits[row.name]):.1f}")
             yield tried
         for name in sorted(tried.fits, key=lambda name: -tried.fits[name].log_evidence)[: self.rules.classes]:
             tried = tried.with_fit(name, self._from_distant_starts(name, tried.fits[name]))
@@ -256,12 +250,12 @@ class ExtensionSearch:
             tried: the refits so far.
             further: whether the model has mechanisms already, so that another needs more evidence.
         """
-        gains = tried.gains(tests.fit)
+        gains = self.gains(tests.fit, tried)
         price = np.log(len(self.candidates)) if further else 0.0
         worth = [name for name, gained in gains.items() if gained >= self.rules.evidence + price]
         if not worth:
             return None
-        best = max(worth, key=lambda name: gains[name] - WIDER * len(tried.fits[name].free))
+        best = max(worth, key=lambda name: gains[name])
         enough = self.rules.class_cosine**2 * tried.drops[best]
         able = [row for row in tried.rows if tried.drops[row.name] > enough]
         # Candidates with equal signatures near null may differ at their fitted size.
@@ -285,12 +279,12 @@ class ExtensionSearch:
             return float(now - then), fit.x
         return lead(self.target, fit, row.probe, row.lm)
 
-    def _leading(self, significant: Sequence[ScoreRow], drops: Mapping[str, float], fit: Fit) -> list[ScoreRow]:
+    def _leading(self, significant: Sequence[ScoreRow], drops: Mapping[str, float]) -> list[ScoreRow]:
         """The best candidates of the leading classes, and further members of these while there is room; candidates that
         cannot reach the required evidence are skipped, and candidates with slow rollouts come last.
         """
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
-        able.sort(key=lambda row: row.rank * np.log(fit.counted) - drops[row.name])
+        able.sort(key=lambda row: -row.score - 0.5 * (drops[row.name] - row.lm))
         heads: list[ScoreRow] = []
         rest: list[ScoreRow] = []
         for row in able:
@@ -372,12 +366,16 @@ class ExtensionSearch:
         self.report(f"{name} from elsewhere: sum of squares {best.residual @ best.residual:.0f}")
         return best
 
-    def surpasses(self, new: Fit, old: Fit, worth: float) -> bool:
-        """Whether a model may replace an earlier choice: its gain must be ``worth`` nats, also with doubled widths of
-        its further priors.
-        """
-        further = max(len(new.free) - len(old.free), 0)
-        return new.log_evidence > old.log_evidence + worth + WIDER * further
+    def gain(self, before: Fit, after: Fit) -> float:
+        """Log Bayes factor of a model and the same model without some mechanisms, whose sizes have an unknown scale."""
+        coordinates = self.target.forward.coordinates
+        added = coordinates.affine[after.free] & ~np.isin(after.free, before.free)
+        sizes = (after.x - coordinates.null)[after.free[added]]
+        return after.log_evidence - before.log_evidence + scale_gain(sizes, after.covariance[np.ix_(added, added)])
+
+    def gains(self, before: Fit, tried: Refits) -> dict[str, float]:
+        """Log Bayes factor of each refitted candidate against the model before."""
+        return {name: self.gain(before, fit) for name, fit in tried.fits.items()}
 
 
 def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None:

@@ -68,11 +68,6 @@ class Fit:
         """Whether the predicted gain of a step is below a nat, or below the accuracy of a large misfit."""
         return self.promise < 1.0 + CLOSE * float(self.residual @ self.residual)
 
-    @property
-    def counted(self) -> float:
-        """Effective number of independent residuals, with correlated rows down-weighted."""
-        return max(min(float(self.residual @ self.residual), len(self.residual)), np.e)
-
     def draws(self, rng: np.random.Generator, count: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Draws of all coordinates, folded back at the bounds."""
         values, vectors = np.linalg.eigh(self.covariance)

@@ -62,7 +62,7 @@ class Named:
     @property
     def gains(self) -> dict[str, float]:
         """Log Bayes factors of the candidates that were refitted beside the last model."""
-        return {} if self.tried is None else self.tried.gains(self.fit)
+        return {} if self.tried is None else self.asked.gains(self.fit, self.tried)
 
     @property
     def waiting(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from rfdropo_bayes.discrepancy.candidates import probe_all, start_together
-from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, WIDER, Added, ExtensionSearch
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import Fit, best_between, heights, optimise
 from rfdropo_bayes.discrepancy.inadequacy import misspecified
 from rfdropo_bayes.discrepancy.score import joint_statistic
@@ -61,21 +61,21 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         added = np.concatenate([c.indices for c in search.candidates if c.name in names])
         start = best_between(target, fit.x, start_together(fit, probes), constant, SHARES)
         fits[names] = optimise(target, start, np.array([*fit.free, *np.setdiff1d(added, fit.free)]))
-        gained = fits[names].log_evidence - fit.log_evidence
+        gained = search.gain(fit, fits[names])
         search.report(f"refit with {' and '.join(names)}: log Bayes factor {gained:.1f}")
     if not fits:
         return []
-    best = max(fits, key=lambda names: fits[names].log_evidence - WIDER * len(fits[names].free))
-    enough = search.surpasses(fits[best], single.fit, worth) if single else True
-    if not enough or fits[best].log_evidence < fit.log_evidence + worth:
+    gains = {names: search.gain(fit, each) for names, each in fits.items()}
+    best = max(fits, key=lambda names: gains[names])
+    if gains[best] < worth + (max(single.log_bayes_factor, 0.0) if single else 0.0):
         return []
     alone = {name: search.refit(fit, rows[name]) for name in best}
-    first, second = sorted(best, key=lambda name: -alone[name].log_evidence)
+    first, second = sorted(best, key=lambda name: -search.gain(fit, alone[name]))
     between = search.score_tests(alone[first], [*named, first])
-    gains = [alone[first].log_evidence - fit.log_evidence, fits[best].log_evidence - alone[first].log_evidence]
+    own, further = search.gain(fit, alone[first]), search.gain(alone[first], fits[best])
     return [
-        Added(first, (first,), tests, alone[first], gains[0], single.refits if single else {}, target),
-        Added(second, (second,), between, fits[best], gains[1], {}, target),
+        Added(first, (first,), tests, alone[first], own, single.refits if single else {}, target),
+        Added(second, (second,), between, fits[best], further, {}, target),
     ]
 
 
@@ -98,7 +98,7 @@ def optimised_again(search: ExtensionSearch, step: Added) -> Fit | None:
 
 
 def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tuple[Added, ...]:
-    """Steps without redundant steps, whose parameters the last model does not need for its evidence, and with a simpler
+    """Steps without redundant steps, whose evidence beside the last step is below `Rules.evidence`, and with a simpler
     candidate in the place of a step if its evidence is larger.
 
     A candidate is simpler if it has fewer parameters. It was refitted in the same step, before the later steps took
@@ -128,7 +128,8 @@ def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tu
         if needed and not simpler:
             continue
         empty = optimise(last.fit_target, emptied, np.setdiff1d(last.fit.free, gone))
-        if empty.log_evidence >= last.fit.log_evidence:
+        own, rules = search.gain(empty, last.fit), search.rules
+        if own < rules.evidence:
             search.report(f"{step.name} is no longer needed")
             return simplified(search, base, without(search, steps, index, base))
         probes = probe_all(search.target, empty, simpler)
@@ -136,11 +137,10 @@ def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tu
             search.target, empty, probes, [c.name for c in simpler], [search.seed, index], search.rules.bootstraps
         )
         fits = {row.name: search.refit(empty, row) for row in tests.rows if row.probe is not None}
-        best = max(fits, key=lambda name: fits[name].log_evidence, default=None)
+        gains = {name: search.gain(empty, fit) for name, fit in fits.items()}
+        best = max(gains, key=lambda name: gains[name], default=None)
         if best is None:
             continue
-        gains = {name: fit.log_evidence - empty.log_evidence for name, fit in fits.items()}
-        own, rules = last.fit.log_evidence - empty.log_evidence, search.rules
         tied = [name for name in gains if gains[name] > max(own, gains[best]) - rules.evidence]
         if gains[best] > own:
             search.report(f"{best} takes the place of {step.name}")
@@ -166,5 +166,5 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
         fit = optimise(step.fit_target, start, np.setdiff1d(step.fit.free, gone))
         under = optimise(step.fit_target.on(fit_targets[-1].forward), before.x, before.free)
         fit_targets.append(step.fit_target)
-        kept.append(replace(step, fit=fit, log_bayes_factor=fit.log_evidence - under.log_evidence))
+        kept.append(replace(step, fit=fit, log_bayes_factor=search.gain(under, fit)))
     return tuple(kept)

@@ -21,6 +21,7 @@ from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.discrepancy.omnibus import Omnibus, block_squares, joint_test, statistics
 from rfdropo_bayes.discrepancy.score import project_out, span, statistic
+from rfdropo_bayes.discrepancy.unknown_size import linear_evidence
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
 DIRECTED = "candidates"
@@ -36,7 +37,7 @@ class ScoreRow:
         lm: score statistic of that probe; rank: its degrees of freedom.
         p: p-value of that probe alone.
         adjusted_p: probability of a statistic this large at any probe of any candidate under a right model.
-        score: LM - rank log n, with n the effective number of values; candidates are ranked by it.
+        score: log Bayes factor of its linear effect [nat], see `unknown_size`; candidates are ranked by it.
     """
 
     name: str
@@ -91,11 +92,11 @@ def run_score_tests(
         bootstraps: number of simulated data sets.
         finer: residuals of the finer simulator with the same parameters.
     """
-    seen = [probe for probe in probes if probe.mark.rank > 0]
+    seen, base = [probe for probe in probes if probe.mark.rank > 0], span(fit.jacobian)
     # As in the simulated data sets, a further step of the parameters is no discrepancy: a prior holds back a size of
     # many of its deviations.
     measured = np.stack([fit.residual] if finer is None else [fit.residual, finer])
-    residuals = project_out(span(fit.jacobian), measured.T).T
+    residuals = project_out(base, measured.T).T
     observed, surprises = _statistics(target, residuals, seen)
     simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
     if target.noise.source == RESIDUALS:  # their mean square equals the residuals' by construction
@@ -118,7 +119,9 @@ def run_score_tests(
         surprise, probe = surprises[0, best], seen[best]
         lm, rank = float(statistic(probe.mark, fit.residual)[0]), probe.mark.rank
         p = max(float(np.exp(-surprise)), float(np.finfo(float).tiny))  # no p-value is zero
-        rows.append(ScoreRow(name, probe, lm, rank, p, tail(surprise, most), lm - rank * np.log(fit.counted)))
+        visible = project_out(base, probe.columns)
+        score = linear_evidence(visible, fit.residual if lm > 0.0 else np.zeros_like(fit.residual))  # of its sign only
+        rows.append(ScoreRow(name, probe, lm, rank, p, tail(surprise, most), score))
     return ScoreTests(
         fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None
     )

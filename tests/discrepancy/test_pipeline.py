@@ -674,17 +674,6 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
         assert kept[-1].fit.log_evidence >= both.log_evidence
 
 
-def test_a_family_takes_the_place_of_a_cause_only_if_it_wins_under_wider_priors_too():
-    """Ten parameters more must bring 3 nats and ten times log 2; as many or fewer parameters, 3 nats."""
-    asked = problem(TRUTH, 1)
-    target, old = base_model(asked, 0)
-    search = ExtensionSearch(target, asked.candidates, asked.rules, 0)
-    family = np.arange(len(old.free) + 10)
-    for free, gain, wins in ((old.free, 2.9, False), (old.free, 3.1, True), (family, 9.8, False), (family, 10.0, True)):
-        new = replace(old, free=free, log_evidence=old.log_evidence + gain)
-        assert search.surpasses(new, old, asked.rules.evidence) == wins
-
-
 def test_what_unseen_recordings_clearly_support_is_adopted_and_no_p_value_is_zero():
     content = found({"play": 1.0}, 1)
     assert content["adopted"] == ["play"]
