@@ -79,6 +79,13 @@ class Coordinates:
         )
 
     @cached_property
+    def sizes(self) -> np.ndarray:
+        """Mask of sizes: coordinates about null whose prior has its centre there, not places or times."""
+        own = ((p.spec, float(p.table.get("loc", p.spec.nominal))) for p in self.space.parameters)
+        central = np.array([centre == spec.nominal and not spec.grid for spec, centre in own])
+        return self.affine & (central | (self.one_sided != 0))
+
+    @cached_property
     def _draws(self) -> dict[str, np.ndarray]:
         if self.draws:
             return dict(self.draws)

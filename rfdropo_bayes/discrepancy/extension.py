@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from rfdropo_bayes.discrepancy.candidates import Candidate, Probe, lead, probe_all, score_test_rollouts
 from rfdropo_bayes.discrepancy.deadline import about
@@ -72,7 +72,7 @@ class Added:
             refitted candidates within `Rules.evidence`.
         before: score tests of the model without it.
         fit: fit of the model with it.
-        log_bayes_factor: log Bayes factor of the models with and without it, by Laplace.
+        log_bayes_factor: log Bayes factor of the models with and without it, see `ExtensionSearch.gain`.
         refits: log Bayes factors of all refitted candidates of this step.
         fit_target: the target under which the fit was found, see `inadequacy`. It has the finer simulator from the step
             `DISCRETISATION` on.
@@ -238,7 +238,8 @@ class ExtensionSearch:
             tried = tried.with_fit(row.name, self._refit(tests.fit, row, leads[row.name][1]))
             self.report(f"refit with {row.name}: log Bayes factor {self.gain(tests.fit, tried.fits[row.name]):.1f}")
             yield tried
-        for name in sorted(tried.fits, key=lambda name: -tried.fits[name].log_evidence)[: self.rules.classes]:
+        gains = self.gains(tests.fit, tried)
+        for name in sorted(gains, key=lambda name: -gains[name])[: self.rules.classes]:
             tried = tried.with_fit(name, self._from_distant_starts(name, tried.fits[name]))
             yield tried
 
@@ -246,7 +247,7 @@ class ExtensionSearch:
         """The best of the refitted candidates with its class; None if no candidate is worth it.
 
         Args:
-            found: score tests of the model without it.
+            tests: score tests of the model without it.
             tried: the refits so far.
             further: whether the model has mechanisms already, so that another needs more evidence.
         """
@@ -284,7 +285,9 @@ class ExtensionSearch:
         cannot reach the required evidence are skipped, and candidates with slow rollouts come last.
         """
         able = [row for row in significant if drops[row.name] > 2.0 * self.rules.evidence]
-        able.sort(key=lambda row: -row.score - 0.5 * (drops[row.name] - row.lm))
+        # A finer mesh has no size that could be unknown.
+        score = {row.name: 0.0 if row.name == DISCRETISATION else row.score - 0.5 * row.lm for row in able}
+        able.sort(key=lambda row: -score[row.name] - 0.5 * drops[row.name])
         heads: list[ScoreRow] = []
         rest: list[ScoreRow] = []
         for row in able:
@@ -367,11 +370,23 @@ class ExtensionSearch:
         return best
 
     def gain(self, before: Fit, after: Fit) -> float:
-        """Log Bayes factor of a model and the same model without some mechanisms, whose sizes have an unknown scale."""
-        coordinates = self.target.forward.coordinates
-        added = coordinates.affine[after.free] & ~np.isin(after.free, before.free)
-        sizes = (after.x - coordinates.null)[after.free[added]]
-        return after.log_evidence - before.log_evidence + scale_gain(sizes, after.covariance[np.ix_(added, added)])
+        """Log Bayes factor of a model against the same model with fewer mechanisms; the added sizes have an unknown
+        scale (`unknown_size`). Other added parameters have their priors.
+        """
+        return after.log_evidence - before.log_evidence + scale_gain(*self._sizes(after, before.free))
+
+    def at_stake(self, fit: Fit, kept: Int[np.ndarray, " kept"]) -> float:
+        """About `gain` over the same model with only some parameters, without a refit (Savage and Dickey's ratio)."""
+        mode, covariance = self._sizes(fit, kept)
+        if len(mode) == 0:
+            return 0.0
+        known = 0.5 * float(mode @ np.linalg.solve(covariance, mode) + np.linalg.slogdet(covariance)[1])
+        return known + scale_gain(mode, covariance)
+
+    def _sizes(self, fit: Fit, known: Int[np.ndarray, " known"]) -> tuple[np.ndarray, np.ndarray]:
+        """Sizes of a fit beside known parameters, and their covariance."""
+        sizes = self.target.forward.coordinates.sizes[fit.free] & ~np.isin(fit.free, known)
+        return fit.x[fit.free[sizes]], fit.covariance[np.ix_(sizes, sizes)]
 
     def gains(self, before: Fit, tried: Refits) -> dict[str, float]:
         """Log Bayes factor of each refitted candidate against the model before."""

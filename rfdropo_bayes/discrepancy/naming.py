@@ -90,7 +90,8 @@ class Named:
         if not self.steps:
             return Named(self.search, fit)
         last = self.steps[-1]
-        gained = last.log_bayes_factor + fit.log_evidence - last.fit.log_evidence
+        gain, before = self.asked.gain, last.before.fit
+        gained = last.log_bayes_factor + gain(before, fit) - gain(before, last.fit)
         return self.extended([*self.steps[:-1], replace(last, fit=fit, log_bayes_factor=gained)])
 
 
@@ -101,6 +102,9 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
     """
     clock, report, rules = search.target.forward.deadline, search.report, search.rules
     named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
+    extended = set[
+        frozenset[str]
+    ]()  # a model that comes back, because a later step has displaced an earlier one, ends it
     while True:
         if named.steps:  # the last model has the noise of its present residuals
             fit_target, fit = fit_with_noise(named.fit_target.measured, named.fit.x, named.fit.free)
@@ -115,6 +119,9 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
         report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")
         if named.asked.room(len(named.steps)) < 1 or p > rules.extended_passes:
             return
+        if frozenset(named.names) in extended:
+            return
+        extended.add(frozenset(named.names))
         with clock.stage("refits"):
             for tried in named.asked.refits(tests):
                 named = replace(named, tried=tried)
@@ -131,6 +138,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
             again = optimised_again(named.asked, step) if len(named.steps) not in renewed else None
             if again is not None:
                 renewed.add(len(named.steps))
+                extended.remove(frozenset(named.names))
                 report(f"without {step.name}, a better optimum than before: the question once more")
                 named = named.with_better(again)
                 continue

@@ -34,7 +34,7 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
 
     Args:
         search: search beside the present model.
-        found: its score tests.
+        tests: its score tests.
         named: mechanisms in it.
         single: the best single mechanism; None without it.
     """
@@ -45,7 +45,7 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
     if not misspecified(single.fit_target if single else target, last.x):
         return []
     rows = {row.name: row for row in tests.rows if row.probe is not None and row.name != DISCRETISATION}
-    heads = sorted(rows.values(), key=lambda row: -row.lm)[: search.rules.members]
+    heads = sorted(rows.values(), key=lambda row: -row.score)[: search.rules.members]
     drops = {
         tuple(sorted((a.name, b.name))): joint_statistic(a.probe.mark, b.probe.mark, fit.residual)
         for a in heads
@@ -67,10 +67,12 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         return []
     gains = {names: search.gain(fit, each) for names, each in fits.items()}
     best = max(fits, key=lambda names: gains[names])
-    if gains[best] < worth + (max(single.log_bayes_factor, 0.0) if single else 0.0):
+    if gains[best] < worth + (single.log_bayes_factor if single else 0.0):
         return []
     alone = {name: search.refit(fit, rows[name]) for name in best}
     first, second = sorted(best, key=lambda name: -search.gain(fit, alone[name]))
+    if any(search.gain(alone[name], fits[best]) < search.rules.evidence for name in best):
+        return []
     between = search.score_tests(alone[first], [*named, first])
     own, further = search.gain(fit, alone[first]), search.gain(alone[first], fits[best])
     return [
@@ -98,7 +100,7 @@ def optimised_again(search: ExtensionSearch, step: Added) -> Fit | None:
 
 
 def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tuple[Added, ...]:
-    """Steps without redundant steps, whose evidence beside the last step is below `Rules.evidence`, and with a simpler
+    """Steps without redundant steps, whose evidence beside all others is below `Rules.evidence`, and with a simpler
     candidate in the place of a step if its evidence is larger.
 
     A candidate is simpler if it has fewer parameters. It was refitted in the same step, before the later steps took
@@ -121,13 +123,10 @@ def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tu
         ]
         emptied = last.fit.x.copy()
         emptied[gone] = null[gone]
-        place = [int(np.flatnonzero(last.fit.free == index)[0]) for index in gone]
-        apart = last.fit.x[gone] - emptied[gone]
-        covariance = last.fit.covariance[np.ix_(place, place)]
-        needed = 0.5 * float(apart @ np.linalg.solve(covariance, apart)) > TOLD_APART  # the least loss [nat]
-        if needed and not simpler:
+        kept = np.setdiff1d(last.fit.free, gone)
+        if not simpler and search.at_stake(last.fit, kept) > TOLD_APART:
             continue
-        empty = optimise(last.fit_target, emptied, np.setdiff1d(last.fit.free, gone))
+        empty = optimise(last.fit_target, emptied, kept)
         own, rules = search.gain(empty, last.fit), search.rules
         if own < rules.evidence:
             search.report(f"{step.name} is no longer needed")
@@ -149,8 +148,8 @@ def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tu
             simple = Added(best, members, tests, fits[best], gains[best], gains, last.fit_target)
             return simplified(search, base, (*without(search, steps, index, base), simple))
         if further := [name for name in tied if name not in step.members]:
-            kept = replace(step, members=(*step.members, *further))
-            steps = (*steps[:index], kept, *steps[index + 1 :])
+            tied_step = replace(step, members=(*step.members, *further))
+            steps = (*steps[:index], tied_step, *steps[index + 1 :])
     return tuple(steps)
 
 
@@ -160,7 +159,11 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
     assert candidate is not None
     gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
     kept, fit_targets = list(steps[:index]), [step.fit_target for step in steps[: index + 1]]
-    for step in steps[index + 1 :]:
+    # The next step now stands on the model before the one that goes, with the tests and refits of that model.
+    following = [
+        replace(step, before=steps[index].before, refits=steps[index].refits) for step in steps[index + 1 :][:1]
+    ]
+    for step in [*following, *steps[index + 2 :]]:
         before, start = kept[-1].fit if kept else base, step.fit.x.copy()
         start[gone] = null[gone]
         fit = optimise(step.fit_target, start, np.setdiff1d(step.fit.free, gone))

@@ -119,8 +119,8 @@ def run_score_tests(
         surprise, probe = surprises[0, best], seen[best]
         lm, rank = float(statistic(probe.mark, fit.residual)[0]), probe.mark.rank
         p = max(float(np.exp(-surprise)), float(np.finfo(float).tiny))  # no p-value is zero
-        visible = project_out(base, probe.columns)
-        score = linear_evidence(visible, fit.residual if lm > 0.0 else np.zeros_like(fit.residual))  # of its sign only
+        usual = target.forward.coordinates.prior_sd[list(probe.amplitudes)] if probe.amplitudes else 1.0
+        score = linear_evidence(project_out(base, probe.columns) * usual, fit.residual, probe.mark.sign)
         rows.append(ScoreRow(name, probe, lm, rank, p, tail(surprise, most), score))
     return ScoreTests(
         fit, tests[0], tuple(sorted(rows, key=lambda row: -row.score)), tests[1] if len(tests) > 1 else None

@@ -301,7 +301,7 @@ def _excluded(answer: Answer) -> str:
         spoken(name)
         for name, value in step.refits.items()
         if name not in step.members
-        and value < step.log_bayes_factor - TOLD_APART
+        and value < step.refits.get(step.name, step.log_bayes_factor) - TOLD_APART
         and all(name != other.name for other in answer.steps)
     ]
     return f"; {', '.join(worse[:MOST_EXCLUDED])} excluded" if worse else ""

@@ -177,7 +177,7 @@ def _hypotheses(
         with clock.part(REFITTED_BY, f"refit with {row.name}"):
             hypotheses.append(Hypothesis(row.name, search.refit(scores.fit, row)))
             report(f"hypothesis {row.name}")
-    hypotheses.sort(key=lambda h: -h.fit.log_evidence)
+    hypotheses.sort(key=lambda h: -search.gain(scores.fit, h.fit))
     return hypotheses[:HYPOTHESES]
 
 

@@ -666,10 +666,16 @@ def test_a_step_that_a_later_one_makes_needless_is_taken_out():
     for first, second, left in (("delay", "play", ["play"]), ("play", "delay", ["play", "delay"])):
         one = optimise(target, base.x, np.array([*base.free, *order[first].indices]))
         both = optimise(target, one.x, np.array([*one.free, *order[second].indices]))
-        fits = {first: one, second: both}
-        steps = [Added(name, (name,), tests, fit, 1.0, {}, target) for name, fit in fits.items()]
+        beside = search.score_tests(one, [first])
+        steps = [
+            Added(first, (first,), tests, one, 1.0, {first: 1.0}, target),
+            Added(second, (second,), beside, both, 1.0, {second: 2.0}, target),
+        ]
         kept = simplified(search, base, steps)
         assert [step.name for step in kept] == left
+        # The first step that is left stands on the base model.
+        assert kept[0].before is tests
+        assert kept[0].refits == {first: 1.0}
         assert set(kept[-1].fit.free) == {*base.free, *(index for name in left for index in order[name].indices)}
         assert kept[-1].fit.log_evidence >= both.log_evidence
 

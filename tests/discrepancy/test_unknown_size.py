@@ -44,6 +44,30 @@ def test_an_effect_of_several_parameters_is_likelier_than_a_half_of_it():
     assert under[0] < under[1]  # with the prior's own scale the half wins
 
 
+def test_a_size_of_one_sign_has_the_evidence_of_half_its_prior():
+    effect = np.random.default_rng(5).standard_normal((40, 1))
+    for size in (1.5, -0.5):
+        residual = size * effect[:, 0] + 0.5
+
+        def ratio(a: float, scale: float, residual: np.ndarray = residual) -> float:
+            gained = 0.5 * (residual @ residual - np.sum((residual - a * effect[:, 0]) ** 2))
+            return float(2.0 * np.exp(gained) * norm.pdf(a, scale=scale))
+
+        integrals = [quad(ratio, 0.0, 40.0, args=(s,), points=[0.0, 1.5], limit=400)[0] for s in SCALES]
+        assert linear_evidence(effect, residual, 1) == pytest.approx(np.log(np.mean(integrals)), abs=1e-5)
+        assert linear_evidence(-effect, residual, -1) == pytest.approx(linear_evidence(effect, residual, 1))
+
+
+def test_a_refit_has_the_evidence_of_the_linear_effect():
+    """`scale_gain` of a mode under the prior, added to its evidence there."""
+    rng = np.random.default_rng(6)
+    effect, residual = 5.0 * rng.standard_normal((30, 3)), 3.0 * rng.standard_normal(30)
+    covariance = np.linalg.inv(np.eye(3) + effect.T @ effect)
+    mode = covariance @ effect.T @ residual
+    alone = 0.5 * residual @ effect @ mode + 0.5 * np.linalg.slogdet(covariance)[1]
+    assert alone + scale_gain(mode, covariance) == pytest.approx(linear_evidence(effect, residual))
+
+
 def test_no_effect_is_no_evidence_and_no_parameter_no_gain():
     effect = np.random.default_rng(4).standard_normal((100, 2))
     assert -5.0 < linear_evidence(effect, np.zeros(100)) < 0.0
