@@ -28,8 +28,6 @@ LOOKED_AT = 20.0  # [s] of a recording, at most
 FEWEST_ROWS = 4  # at the beginning, to compare on
 RANK = 1e-9  # singular values below this share of the largest are rounding: channels that move together
 CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 starts none fell on the wrong side
-
-
 MEMORY = "memory"  # the format of recordings from arrays
 UNTOLD = ("asl-csv", "csv", "motive-csv", "rosbag", "lerobot", MEMORY)
 """Formats that do not state the command before their first row."""

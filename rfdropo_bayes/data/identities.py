@@ -14,8 +14,6 @@ from jaxtyping import Bool, Float
 from scipy.optimize import linear_sum_assignment
 
 APART = 5e-3  # [m]: nearer markers are not distinguishable
-
-
 NEARER = 0.25  # share of the distance from itself within which the other marker was expected
 
 

@@ -19,14 +19,10 @@ from rfdropo_bayes.robots import Motor, Robot
 from rfdropo_bayes.tables import parse_table
 
 _SLACK = 0.7  # of the homing tension: a cable is let out to here before it is pulled, so that all approach from below
-
-
 _MEDIAN = 5  # cycles: a torque is noisy, and one reading must not decide
 
 
 VALID_H = 24.0  # age above which a result is refused
-
-
 TORQUE_FACTOR = 2.0  # the torque limit as a multiple of the homing tension
 
 

@@ -13,8 +13,6 @@ from rfdropo_bayes.deployment import objects
 from rfdropo_bayes.errors import InputError
 
 EDS_REMEDY = "give the data sheet that came with this drive"
-
-
 _PDO = (0x1400, 0x1600, 0x1800, 0x1A00)
 
 

@@ -14,8 +14,6 @@ from rfdropo_bayes.discrepancy.candidates import Candidate
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 ZEROS = "initial_displacement"  # of cables, see `Robot`
-
-
 MEASURED = "offset_"  # of the frame: `camera_offset` is the library's name for it
 
 

@@ -9,8 +9,6 @@ from jaxtyping import Bool, Float
 from scipy.stats import norm
 
 BLOCK = 10  # rows
-
-
 LAGS = 10
 
 

@@ -23,8 +23,6 @@ from rfdropo_bayes.discrepancy.score_tests import tail
 from rfdropo_bayes.mechanisms.ports import Port
 
 MEMORIES = (0.1, 0.4, 1.5, 6.0)  # [s]
-
-
 SIZES = np.geomspace(0.01, 30.0, 15)  # of a signal, in sizes of its port
 
 

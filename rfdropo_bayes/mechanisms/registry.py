@@ -46,8 +46,6 @@ def defined_in(module: ModuleType) -> list[Any]:
 
 KINDS = (*(kind for module in MODULES for kind in defined_in(module)), *map(drift_of, DRIFTING))
 REGISTRY: dict[str, type] = {kind.name: kind for kind in KINDS}
-
-
 ACTS = {"actuation": ("actuate",), "body": ("embody",), "contact": ("embody",), "sensing": ("sense", "sense_over_time")}
 """By which method a mechanism of each stage acts."""
 

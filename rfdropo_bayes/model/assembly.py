@@ -72,8 +72,6 @@ SWITCHED = {  # channels beside the markers, by the key of [model] that makes th
     "orientation": (ORIENTATION_NOISE, *FRAME_TURNS),
 }
 GAINS = (TENSION_GAIN, *FRAME_TURNS)  # parameters of channels that are known unless they have a prior
-
-
 REST_CLOCK = 0.05  # step [s] of drives and cameras of a body at rest, which has no time step itself
 
 

@@ -16,8 +16,6 @@ from rfdropo_bayes.policies.evaluation import Episode
 from rfdropo_bayes.report.style import CYCLE, WIDTH, empty, styled
 
 MILLIMETRES = 1e3
-
-
 INTERVALS = 4  # between the ticks of a panel in a third of the page: the labels of more would overlap
 
 

@@ -12,14 +12,10 @@ from rfdropo_bayes.tables import nearest
 
 # Arguments that a training sets itself.
 OURS = ("self", "policy", "env", "seed", "device", "tensorboard_log", "verbose", "_init_setup_model")
-
-
 OBJECTS = ("rollout_buffer_class",)  # objects of Python, which no file can hold
 
 
 SHORT = ("net_arch", "log_std_init", "activation")  # options that need no ``policy_kwargs``
-
-
 LARGEST_BATCH = 512
 
 

@@ -8,14 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 OUTERMOST = 0.005  # of the prior, on either side
-
-
 SPARSE = 0.1  # of the mean density between the quartiles
 
 
 NEIGHBOURS = 5  # prior draws on the denser side, which estimate the density at a place
-
-
 PILED = 0.13  # of a standard deviation, between a half-normal (0.10) and a uniform distribution (0.17)
 
 

@@ -15,8 +15,6 @@ from rfdropo_bayes.report.object_scores import ObjectScore
 from rfdropo_bayes.report.residuals import ResidualCheck
 
 PACKAGES = ("rfdropo_bayes", "jax", "numpyro", "blackjax", "arviz", "numpy", "scipy", "numba")
-
-
 LEARNING = ("torch", "stable_baselines3", "gymnasium", "onnx", "onnxruntime")  # packages that policies are made with
 
 

@@ -12,14 +12,10 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.data.sample_times import sample_time
 
 SPANS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)  # history that is looked at [s]
-
-
 LAGS = 11  # at most, evenly spaced over the span
 
 
 PENALTIES = 10.0 ** np.arange(-6.0, 1.5, 1.0)  # per row, of standardised features
-
-
 BLOCKS = 5
 
 

@@ -13,8 +13,6 @@ from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.report.style import WIDTH, empty, styled
 
 MILLIMETRES = 1e3
-
-
 MOST_COLUMNS = 4
 
 

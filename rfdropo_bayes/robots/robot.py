@@ -51,8 +51,6 @@ REQUIRED = (
 )
 """Parameters every robot has."""
 ZEROS = "initial_displacement"  # parameter of every cable that is driven by a displacement
-
-
 DRIVEN = {"m": "m", "rad": "m", "N": "N", "N m": "N", "Pa": ("Pa",), "-": ("N", "Pa")}
 """Units of the drives of cables and chambers, by the unit of the commands."""
 USUAL_SHARE = 0.4  # usual commands over the largest command: recordings seldom use the whole travel

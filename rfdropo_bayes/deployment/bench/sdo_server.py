@@ -19,14 +19,10 @@ from canopen.sdo.constants import (
 )
 
 NO_SUCH_SUBINDEX = 0x06090011
-
-
 READ_ONLY = 0x06010002
 
 
 WRONG_LENGTH = 0x06070010
-
-
 INVALID_COMMAND = 0x05040001
 
 

@@ -19,8 +19,6 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.modes.optimisation import Laplace
 
 CERTAIN = 2.0  # standard errors by which an optimum must be worse to be left out
-
-
 STRONG = 3.0  # nats by which it must also be worse: less is no strong evidence under any noise (Kass & Raftery 1995)
 
 

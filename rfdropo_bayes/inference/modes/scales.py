@@ -22,14 +22,10 @@ from scipy.stats import multivariate_t
 from rfdropo_bayes.inference.modes.optimisation import Laplace
 
 DRAWS = 4000  # of the proposal, from which the scales are resampled
-
-
 FREEDOM = 5.0  # of the proposal, a Student-t around the mode of the scales' logarithms: it has to have their tails
 
 
 DIFFERENCE = 1e-2  # of a logarithm, for second differences
-
-
 WIDEST = 2.0  # deviation of the proposal's logarithms: beyond it the prior is as narrow
 
 

@@ -18,14 +18,10 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 
 WIDTH = 4.0  # every parameter's search range is scaled to [0, 4]
-
-
 SMALLEST_STD = 1e-5  # in these units
 
 
 LARGEST_STD = WIDTH / 4.0
-
-
 TRUNCATION = 2.0  # standard deviations
 
 
