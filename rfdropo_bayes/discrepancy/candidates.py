@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
-from rfdropo_bayes.discrepancy.score import Signature, project_out, signature, span
+from rfdropo_bayes.discrepancy.score import VISIBLE, Signature, project_out, signature, span
 from rfdropo_bayes.posteriors import label
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 
@@ -20,7 +20,6 @@ WAY = np.geomspace(0.05, 1.5, 12)  # shares of the path from null to a trial sha
 NOTHING = 1e-6  # of a sum of squares: the rounding of two that are equal
 NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
 SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in prior deviations; the slope at null shows small sizes
-UNSEEN = 1e-6  # of the whitened data per prior deviation: the parameter does nothing at null
 
 
 def spoken(name: str) -> str:
@@ -96,9 +95,9 @@ class Candidate:
 def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> list[Probe]:
     """Probes of every candidate at a fit of the present model, all in a few batches of rollouts.
 
-    A parameter without effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid. If the
-    shape alone changes the data, that change is the direction; otherwise the amplitudes are differentiated at the trial
-    value.
+    A parameter without visible effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid.
+    If the shape alone changes the data visibly, that change is the direction; otherwise the amplitudes are
+    differentiated at the trial value. Rounding of a solver is an effect, too, but not a visible one.
     """
     base, coordinates = span(fit.jacobian), target.forward.coordinates
     open_ = [c for c in candidates if c.indices]
@@ -111,7 +110,7 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
     jobs: list[tuple[Candidate, dict[int, float]]] = []
     probes: list[Probe] = []
     for candidate in open_:
-        unseen = [i for i in candidate.indices if np.linalg.norm(column[i]) < UNSEEN]
+        unseen = [i for i in candidate.indices if np.linalg.norm(column[i]) < VISIBLE]
         grids = {i: coordinates.space.parameters[i].spec.grid for i in unseen}
         # If an amplitude has an effect, another amplitude without effect (a tilt about gravity itself) is no shape.
         all_unseen = len(unseen) == len(candidate.indices)
@@ -149,7 +148,7 @@ def _probe_grid(
             points[row, index] = value
     residual = target.recall("grid", [points], lambda: {"residual": target.residual(points)})["residual"]
     secants = np.clip(fit.residual - residual, -1e3, 1e3)
-    alone = np.linalg.norm(secants, axis=1) > UNSEEN
+    alone = np.linalg.norm(secants, axis=1) > VISIBLE
     slots = [(row, i) for row, (c, p) in enumerate(jobs) if not alone[row] for i in c.indices if i not in p]
     rows = np.array([row for row, _ in slots], dtype=int)
     directions = np.eye(points.shape[1])[[i for _, i in slots]] if slots else np.zeros((0, points.shape[1]))

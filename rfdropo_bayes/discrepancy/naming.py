@@ -102,9 +102,8 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
     """
     clock, report, rules = search.target.forward.deadline, search.report, search.rules
     named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
-    extended = set[
-        frozenset[str]
-    ]()  # a model that comes back, because a later step has displaced an earlier one, ends it
+    # Names of the mechanisms of every model that was extended: each set once, also if steps are dropped.
+    extended = set[frozenset[str]]()
     while True:
         if named.steps:  # the last model has the noise of its present residuals
             fit_target, fit = fit_with_noise(named.fit_target.measured, named.fit.x, named.fit.free)

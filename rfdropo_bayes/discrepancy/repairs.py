@@ -159,7 +159,7 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
     assert candidate is not None
     gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
     kept, fit_targets = list(steps[:index]), [step.fit_target for step in steps[: index + 1]]
-    # The next step now stands on the model before the one that goes, with the tests and refits of that model.
+    # The next step now follows the model before the dropped step, with the tests and refits beside that model.
     following = [
         replace(step, before=steps[index].before, refits=steps[index].refits) for step in steps[index + 1 :][:1]
     ]

@@ -43,7 +43,7 @@ from rfdropo_bayes.report.audit_figures import binned
 from rfdropo_bayes.report.audit_page import class_effects, render_audit, shown
 from rfdropo_bayes.report.page import p_value
 
-from .toys import CANDIDATES, NOISE, ROWS, STEP, Toy, problem, recordings
+from .toys import CANDIDATES, NOISE, ROWS, STEP, Stopped, Toy, problem, problem_of, recordings
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
@@ -102,6 +102,13 @@ def test_a_shape_that_means_nothing_at_null_is_found_on_its_grid():
     assert content["findings"][0]["mechanism"] == "creep"
     time = content["findings"][0]["parameters"]["creep_time"]
     assert abs(time["mean"] - 0.6) < 4 * time["sd"]
+
+
+def test_a_limit_that_only_rounding_shows_at_null_is_found_on_its_grid():
+    asked = problem_of(Stopped(), {**TRUTH, "limit": 1.0}, 5)
+    target, base = base_model(asked, asked.seed)
+    search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
+    assert search.score_tests(base).row("limit").adjusted_p <= asked.rules.family
 
 
 @pytest.mark.slow

@@ -152,7 +152,21 @@ class Turned(Geared):
     parameters = (*Toy.parameters, spec("radius"), *Geared.added["cable_gains"])
 
 
-EVERY_CANDIDATE = {**CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Turned.added}
+class Stopped(Toy):
+    """The toy with a limit that acts from half a deviation of its prior on. Below, it has the effect of rounding."""
+
+    added = types.MappingProxyType({"limit": (spec("limit", 0.0, {"distribution": "HalfNormal", "scale": 1.0}),)})
+    parameters = (*Toy.parameters, *added["limit"])
+
+    def rollout(self, parameters, commands, steps=None):
+        seen = super().rollout(parameters, commands, steps)
+        level = jnp.concatenate([commands.initial[None], commands.step])[:, 1, None, None]
+        limit = parameters.get("limit", 0.0)
+        size = 0.2 * jnp.maximum(limit - 0.5, 0.0) + 1e-6 * limit
+        return seen._replace(position=seen.position + size * level * FURTHER[0])
+
+
+EVERY_CANDIDATE = {**CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Turned.added, **Stopped.added}
 
 
 @cache
@@ -271,7 +285,7 @@ def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weig
 TRUTH_OF_CABLES = {"gain": 1.3, "bend": -0.4}
 
 
-def problem_of(toy: Opposed | Geared | Turned, truth: dict, seed: int, base: int = len(BASE)) -> AuditProblem:
+def problem_of(toy: Opposed | Geared | Turned | Stopped, truth: dict, seed: int, base: int = len(BASE)) -> AuditProblem:
     """A data set of a toy with further candidates, which are all that may be named."""
     asked, trajectories = problem({}, seed), recordings(truth, seed, toy)
     gathered = gather_recordings(toy, trajectories)
