@@ -36,6 +36,13 @@ ONCE = 'data.fit=["fit_1.nc", "screen.nc"]'  # an override that leaves the repea
 WHOLE = "with_whole_library"
 LEARNT = 0.5  # of a prior's deviation that a posterior's is below where the data, not the prior, say the size
 TRIES = 8  # mechanisms that are tried until one reaches the wanted size
+FAMILIES = {
+    "command_delay": "cable_delay",
+    "command_gain": "cable_gain",
+    "command_gain_drift": "cable_gain_drift",
+    "camera_offset": "marker_offset",
+}
+"""Families that contain a mechanism: the same effect if their parameters are equal."""
 
 
 SHARED = 0.8  # of the noise's variance
@@ -265,9 +272,9 @@ def _hidden(
 
 
 def _without(content: Mapping[str, Any], names: Sequence[str], exclude: Sequence[str]) -> str:
-    """An override that takes the hidden mechanism and its class out of the library."""
+    """An override that takes the hidden mechanism, its family and its class out of the library."""
     alike = {c["mechanism"]: c["cosines"] for c in content["candidates"]}
-    out = set(names) | set(exclude)
+    out = set(names) | set(exclude) | {FAMILIES[name] for name in names if name in FAMILIES}
     for name in names:
         out |= {pair["mechanism"] for pair in alike.get(name, []) if pair["cosine"] > 0.95}
     return f"audit.exclude={json.dumps(sorted(out & set(REGISTRY)))}"
