@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rfdropo_bayes.errors import InputError
-from studies.audit_study import CONDITIONS, LEDGER, TABLE, WHOLE, _turn, judge, run_study, summarise
+from rfdropo_bayes.mechanisms import REGISTRY
+from studies.audit_study import CONDITIONS, FAMILIES, LEDGER, TABLE, WHOLE, _turn, _without, judge, run_study, summarise
 from studies.hidden_effects import Hidden
 
 CONTENT = {
@@ -117,6 +118,14 @@ def test_audits_before_a_mechanism_was_removed_count_where_nothing_was_removed(t
     assert found["rho_0.5"]["verdicts"] == {"equivalent": 1}
     assert found["rho_0.5"]["named_first"] == 1
     assert [found[name]["datasets"] for name in ("rho_0.15", "two_effects_rho_1", "null")] == [0, 0, 0]
+
+
+def test_a_hidden_cause_is_removed_with_its_family_and_with_its_doubles():
+    alike = [{"mechanism": "spool_growth", "cosine": 0.97}, {"mechanism": "payload", "cosine": 0.4}]
+    content = {"candidates": [{"mechanism": "command_gain", "cosines": alike}]}
+    override = _without(content, ["command_gain"], ["backlash"])
+    assert override == 'audit.exclude=["backlash", "cable_gain", "command_gain", "spool_growth"]'
+    assert set(FAMILIES) | set(FAMILIES.values()) <= set(REGISTRY)
 
 
 def test_where_nothing_is_to_be_found_the_audit_is_on_a_finer_mesh():
