@@ -127,7 +127,7 @@ def page() -> str:
         robots=robots(),
         days=days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
-        motion=audits("audit_power/rod/datasets.jsonl"),
+        motion=audits("audit_power/unknown_scale/datasets.jsonl"),
         sizes=sizes(),
         reach=table1(""),
         push=table1("push_20"),
