@@ -72,9 +72,9 @@ def test_a_bar_shows_its_title_as_it_is(capsys):
 def test_a_prediction_says_what_it_does_before_it_has_done_it(tmp_path, monkeypatch):
     """What it says is no part of the result."""
     (tmp_path / "posterior.nc").touch()
-    monkeypatch.setattr("rfdropo_bayes.cli.audit_commands.see_calibration", lambda *_: None)
-    monkeypatch.setattr("rfdropo_bayes.cli.audit_commands.look_through", lambda *_: None)
-    monkeypatch.setattr("rfdropo_bayes.cli.audit_commands.show_prediction", lambda *_, **__: None)
+    monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.see_calibration", lambda *_: None)
+    monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.look_through", lambda *_: None)
+    monkeypatch.setattr("rfdropo_bayes.cli.prediction_commands.show_prediction", lambda *_, **__: None)
     monkeypatch.setattr("rfdropo_bayes.model.model.Model.read", lambda *_: None)
     monkeypatch.setattr("rfdropo_bayes.results.calibrated.Calibration.of_posterior", lambda *_: None)
     monkeypatch.setattr("rfdropo_bayes.verbs.predict.predict", lambda *_, **__: SimpleNamespace(content={}))

@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecNormalize
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.policies import onnx_export
+from rfdropo_bayes.policies import onnx_export, parity
 from rfdropo_bayes.policies import training as run
 from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy
 from rfdropo_bayes.policies.parity import check_exportable, difference, observations
@@ -106,7 +106,7 @@ def test_an_export_that_leaves_out_a_tanh_is_refused(monkeypatch) -> None:
 def test_an_export_without_the_limits_of_the_normalisation_is_refused(monkeypatch) -> None:
     policy = untrained({})
     unlimited = VecNormalize(Points(4), epsilon=1e-4, clip_obs=1e9)
-    monkeypatch.setattr(onnx_export, "export_policy", lambda model, _, *rest: export_policy(model, unlimited, *rest))
+    monkeypatch.setattr(parity, "export_policy", lambda model, _, *rest: export_policy(model, unlimited, *rest))
     with pytest.raises(InputError, match="would act otherwise"):
         check(policy)
 
