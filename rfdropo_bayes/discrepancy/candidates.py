@@ -17,7 +17,6 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
 LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
 WAY = np.geomspace(0.05, 1.5, 12)  # shares of the path from null to a trial shape
-NOTHING = 1e-6  # of a sum of squares: the rounding of two that are equal
 NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
 SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in prior deviations; the slope at null shows small sizes
 
@@ -210,7 +209,7 @@ def lead(target: FitTarget, fit: Fit, probe: Probe, lm: float) -> tuple[float, F
         low, high = ladder[max(best - 1, 0)], ladder[min(best + 1, len(ladder) - 1)]
         # For a stop that cables seldom reach, a rung has no effect and the next far too much: the optimum lies between
         # them.
-        if drop > NOTHING or high < NEIGHBOURS * low:
+        if drop > VISIBLE**2 or high < NEIGHBOURS * low:
             return drop, start
         ladder = np.geomspace(low, high, len(WAY))
 
