@@ -94,7 +94,8 @@ SCENES = {
 
 
 def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[str, Path]:
-    """Draw a target, and write its files and recordings.
+    """Draw a target, and write its files and recordings. A folder that holds a target keeps it, since another library of
+    mechanisms draws another target from the same seed; its recordings are written again.
 
     Args:
         kind: "library", three mechanisms of the library, their sizes drawn from their priors; "unknown", two laws
@@ -110,16 +111,25 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
         the audit. The last two have no part of the truth.
 
     Raises:
-        InputError: an unknown kind or scene, a trunk in MuJoCo, or a target whose recordings cannot be simulated.
+        InputError: unknown kind or scene, a trunk in MuJoCo, or a target whose recordings cannot be simulated.
     """
-    model, chosen = draw_flaws(kind, seed, scene), SCENES[scene]
     out = output_folder(Path(out))
+    files = {name: out / f"{name}.toml" for name in ("truth", scene, "audit")}
+    if not all(path.exists() for path in files.values()):
+        _draw(kind, seed, scene, files)
+    _record(SCENES[scene], files["truth"], seed)
+    return files
+
+
+def _draw(kind: str, seed: int, scene: str, files: Mapping[str, Path]) -> None:
+    """Draw a target and write its files."""
+    model, chosen = draw_flaws(kind, seed, scene), SCENES[scene]
     truth, robot = (
         {"robot": chosen.robot, "simulator": {**chosen.simulated, **chosen.finer}, "model": model},
         chosen.robot,
     )
     if kind == "mujoco":
-        truth, robot = _in_mujoco(chosen, model, out)
+        truth, robot = _in_mujoco(chosen, model, files["truth"].parent)
         chosen = replace(chosen, robot=robot)
     training = {**chosen.task, "noise": NOISE}
     every = training | {"anneal": True, "evaluate_every": chosen.evaluated}
@@ -132,12 +142,8 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
     }
     if kind == "mujoco":  # laws fit what the engines differ by, term after term: after an hour there was no end
         tables["audit"]["audit"] = {"ports": False}
-    files = {}
-    for name, table in tables.items():
-        files[name] = out / f"{name}.toml"
-        write_text(files[name], describe({"robot": robot, "seed": seed, **table}))
-    _record(chosen, files["truth"], seed)
-    return files
+    for name, path in files.items():
+        write_text(path, describe({"robot": robot, "seed": seed, **tables[name]}))
 
 
 def draw_flaws(kind: str, seed: int, scene: str = "reach") -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -47,6 +48,15 @@ def test_a_seed_makes_the_same_files_and_recordings(target, tmp_path) -> None:
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one.position, other.position)
     assert len({recording.command.tobytes() for recording in first}) == len(RECORDINGS)
+
+
+def test_a_folder_keeps_its_target_if_the_seed_would_draw_another(target, tmp_path) -> None:
+    for path in target.values():
+        shutil.copy(path, tmp_path)
+    make_target("unknown", 1, tmp_path)
+    for path in target.values():
+        assert (tmp_path / path.name).read_text() == path.read_text()
+    assert all((tmp_path / f"{name}.nc").exists() for name in RECORDINGS)
 
 
 def test_recordings_and_files_of_fits_do_not_tell_the_truth(target) -> None:
