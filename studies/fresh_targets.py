@@ -94,8 +94,10 @@ SCENES = {
 
 
 def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[str, Path]:
-    """Draw a target, and write its files and recordings. A folder that holds a target keeps it, since another library of
-    mechanisms draws another target from the same seed; its recordings are written again.
+    """Draw a target, and write its files and recordings.
+
+    A folder that holds a target keeps it, since another library of mechanisms draws another target from the same seed;
+    its recordings are written again.
 
     Args:
         kind: "library", three mechanisms of the library, their sizes drawn from their priors; "unknown", two laws

@@ -24,7 +24,7 @@ from rfdropo_bayes.discrepancy import base_fit
 from rfdropo_bayes.discrepancy import held_out as held_out_module
 from rfdropo_bayes.discrepancy.audit_record import _doubt, next_experiment, record
 from rfdropo_bayes.discrepancy.base_fit import base_model, first_target
-from rfdropo_bayes.discrepancy.candidates import lead
+from rfdropo_bayes.discrepancy.candidates import lead, probe_all
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits, Rules
@@ -43,7 +43,7 @@ from rfdropo_bayes.report.audit_figures import binned
 from rfdropo_bayes.report.audit_page import class_effects, render_audit, shown
 from rfdropo_bayes.report.page import p_value
 
-from .toys import CANDIDATES, NOISE, ROWS, STEP, Stopped, Toy, problem, problem_of, recordings
+from .toys import CANDIDATES, NOISE, ROWS, STEP, Faint, Stopped, Toy, problem, problem_of, recordings
 
 TRUTH = {"gain": 1.3, "bend": -0.4}
 
@@ -109,6 +109,13 @@ def test_a_limit_that_only_rounding_shows_at_null_is_found_on_its_grid():
     target, base = base_model(asked, asked.seed)
     search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
     assert search.score_tests(base).row("limit").adjusted_p <= asked.rules.family
+
+
+def test_trial_values_of_a_large_family_without_visible_effect_stay_few():
+    asked = problem_of(Faint(), TRUTH, 5)
+    target, base = base_model(asked, asked.seed)
+    faint = [candidate for candidate in asked.candidates if candidate.name == "faint"]
+    assert 1 <= len(probe_all(target, base, faint)) <= 5
 
 
 @pytest.mark.slow

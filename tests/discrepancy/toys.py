@@ -166,7 +166,22 @@ class Stopped(Toy):
         return seen._replace(position=seen.position + size * level * FURTHER[0])
 
 
-EVERY_CANDIDATE = {**CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Turned.added, **Stopped.added}
+class Faint(Toy):
+    """The toy with a family of eight parameters, whose effects no recording can show one by one."""
+
+    added = types.MappingProxyType({"faint": tuple(spec(f"faint_{k}") for k in range(8))})
+    parameters = (*Toy.parameters, *added["faint"])
+
+    def rollout(self, parameters, commands, steps=None):
+        seen = super().rollout(parameters, commands, steps)
+        level = jnp.concatenate([commands.initial[None], commands.step])[:, 1, None, None]
+        size = 5e-4 * sum(parameters.get(each.name, 0.0) for each in self.added["faint"])
+        return seen._replace(position=seen.position + size * level * FURTHER[0])
+
+
+EVERY_CANDIDATE = {
+    **CANDIDATES, "drag": (Pulling.parameters[-1],), **Opposed.added, **Turned.added, **Stopped.added, **Faint.added
+}  # fmt: skip
 
 
 @cache
@@ -285,7 +300,9 @@ def problem_of_cables(truth: dict, seed: int, tension: bool, weighed: tuple[Weig
 TRUTH_OF_CABLES = {"gain": 1.3, "bend": -0.4}
 
 
-def problem_of(toy: Opposed | Geared | Turned | Stopped, truth: dict, seed: int, base: int = len(BASE)) -> AuditProblem:
+def problem_of(
+    toy: Opposed | Geared | Turned | Stopped | Faint, truth: dict, seed: int, base: int = len(BASE)
+) -> AuditProblem:
     """A data set of a toy with further candidates, which are all that may be named."""
     asked, trajectories = problem({}, seed), recordings(truth, seed, toy)
     gathered = gather_recordings(toy, trajectories)
