@@ -90,20 +90,16 @@ def elastica(young: float, density: float, section: Section) -> tuple[float, flo
     return float(found.y[0, -1]), float(found.y[1, -1])
 
 
-def hanging(elements: int) -> Assembly:
-    """The bar as a rod without cables: gravity acts along x, across the bar."""
+def rod(name: str, elements: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    """Tips of rods of an engine without cables, across which gravity acts, and whether each was found."""
     body = fem.uniform_rod(LENGTH, SIDE / 2.0, SIDE / 2.0, elements)
     system = fem.System(body, fem.cable_layout(body, np.zeros((0, 3)), []))
-    return Assembly(system, fem.attach(body, np.array([[0.0, 0.0, LENGTH]])), np.arange(elements + 1))
-
-
-def rod(name: str, elements: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """Tips of rods of an engine, and whether each was found."""
-    engine = Engine(hanging(elements), 0.01, Backend(name, "float64", 1), integrator="quasi-static")  # type: ignore[arg-type]
+    assembly = Assembly(system, fem.attach(body, np.array([[0.0, 0.0, LENGTH]])), np.arange(elements + 1))
+    engine = Engine(assembly, 0.01, Backend(name, "float64", 1), integrator="quasi-static")  # type: ignore[arg-type]
 
     def tip(young: jax.Array, density: jax.Array) -> tuple[jax.Array, jax.Array]:
         material = fem.material(
-            engine.body.system, young_modulus=young, density=density, poisson_ratio=POISSON, gravity=(GRAVITY, 0.0, 0.0)
+            system, young_modulus=young, density=density, poisson_ratio=POISSON, gravity=(GRAVITY, 0.0, 0.0)
         )
         motion = engine.motion(material, jnp.zeros(0), jnp.zeros((1, 0)), None)
         place = motion.position[-1].reshape(-1, 3)[-1]
@@ -138,7 +134,7 @@ def soromox(pieces: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, ja
         start = (jnp.zeros(body.num_coordinates), jnp.inf, 0)
         at, moved, _ = jax.lax.while_loop(lambda state: (state[1] > SETTLED) & (state[2] < MOST), better, start)
         _, level, up = body.forward_kinematics_abscissa_batched(at, jnp.array([LENGTH]))[0]
-        return jnp.stack([level, -up]), moved <= SETTLED
+        return jnp.stack([level, -up]), jnp.asarray(moved <= SETTLED)
 
     return tip
 
@@ -166,7 +162,7 @@ def main() -> None:
     factors = np.random.default_rng(0).uniform(0.8, 1.2, (2, given.batch))
     bars = jnp.asarray(factors * np.array([[4.5e5], [1000.0]]))
     square, disc = (
-        np.array([elastica(*values, section) for values in np.asarray(bars)[:, :CHECKED].T])
+        np.array([elastica(young, density, section) for young, density in np.asarray(bars)[:, :CHECKED].T])
         for section in (SQUARE, DISC)
     )
     rows = []
