@@ -83,8 +83,9 @@ format: $(DEV) ## let ruff mend what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-bench: $(CORE) ## rollouts per second of the engines beside others, in reports/rollouts (minutes, on an idle machine)
+bench: $(CORE) ## rollouts and poses per second beside other simulators, in reports/rollouts (minutes, on an idle machine)
 	$(BIN)/python benchmarks/rollouts.py --push --json reports/rollouts/rollouts.json
+	$(BIN)/python benchmarks/poses.py --json reports/rollouts/poses.json
 
 validate: $(CORE) ## references and other simulators with ours beside them, in reports/validation (minutes)
 	$(BIN)/python benchmarks/validate.py

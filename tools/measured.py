@@ -75,6 +75,12 @@ def audits(ledger: str) -> dict[str, Mapping[str, Any]]:
     return {**shares, "sizes": counted(sum(held), len(held))}
 
 
+def asl_days() -> dict[str, float]:
+    """Error [mm] of each day of the ASL trunk by a fit to the other days."""
+    found = json.loads((REPORTS / "asl_trunk" / "rod" / "summary.json").read_text(encoding="utf-8"))
+    return {day: 1e3 * error for day, error in found["unseen_sessions"]["sessions"].items()}
+
+
 def sizes() -> Mapping[str, Any]:
     """Share of 90 % intervals that hold the size, given the right cause."""
     learnt = [size for line in read_lines(REPORTS / "size_coverage" / "rod.jsonl") for size in line.get("sizes", [])]
@@ -126,11 +132,11 @@ def page() -> str:
     return words.get_template("measured.md.j2").render(
         robots=robots(),
         days=days(),
+        asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
         motion=audits("audit_power/unknown_scale/datasets.jsonl"),
         sizes=sizes(),
-        reach=table1(""),
-        push=table1("push_20"),
+        inferred=table1("rod"),
         trunk=json.loads((REPORTS / "sim2real_trunk" / "summary.json").read_text(encoding="utf-8")),
         policies=policies,
         sbc=sbc(),
