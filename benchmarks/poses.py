@@ -23,7 +23,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -90,12 +90,12 @@ def elastica(young: float, density: float, section: Section) -> tuple[float, flo
     return float(found.y[0, -1]), float(found.y[1, -1])
 
 
-def rod(name: str, elements: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+def rod(name: Literal["numba", "jax"], elements: int) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
     """Tips of rods of an engine without cables, across which gravity acts, and whether each was found."""
     body = fem.uniform_rod(LENGTH, SIDE / 2.0, SIDE / 2.0, elements)
     system = fem.System(body, fem.cable_layout(body, np.zeros((0, 3)), []))
     assembly = Assembly(system, fem.attach(body, np.array([[0.0, 0.0, LENGTH]])), np.arange(elements + 1))
-    engine = Engine(assembly, 0.01, Backend(name, "float64", 1), integrator="quasi-static")  # type: ignore[arg-type]
+    engine = Engine(assembly, 0.01, Backend(name, "float64", 1), integrator="quasi-static")
 
     def tip(young: jax.Array, density: jax.Array) -> tuple[jax.Array, jax.Array]:
         material = fem.material(
@@ -166,7 +166,8 @@ def main() -> None:
         for section in (SQUARE, DISC)
     )
     rows = []
-    for name in ("numba", "jax"):
+    names: tuple[Literal["numba", "jax"], ...] = ("numba", "jax")
+    for name in names:
         for elements in ELEMENTS:
             rows.append(measure(f"ours, {name}, {elements} elements", 6 * elements, rod(name, elements), bars, square))
             print(rows[-1], flush=True)

@@ -75,10 +75,11 @@ def audits(ledger: str) -> dict[str, Mapping[str, Any]]:
     return {**shares, "sizes": counted(sum(held), len(held))}
 
 
-def asl_days() -> dict[str, float]:
-    """Error [mm] of each day of the ASL trunk by a fit to the other days."""
+def asl_days() -> list[tuple[float, float]]:
+    """Errors [mm] of each day of the ASL trunk: by a fit to the other days, and of its first pose held."""
     found = json.loads((REPORTS / "asl_trunk" / "rod" / "summary.json").read_text(encoding="utf-8"))
-    return {day: 1e3 * error for day, error in found["unseen_sessions"]["sessions"].items()}
+    sessions, held = found["unseen_sessions"]["sessions"], found["baselines"]["initial_pose"]["fit"]["recordings"]
+    return [(1e3 * error, row["over_time"]) for error, row in zip(sessions.values(), held.values(), strict=True)]
 
 
 def sizes() -> Mapping[str, Any]:

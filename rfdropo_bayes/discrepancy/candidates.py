@@ -16,7 +16,7 @@ from rfdropo_bayes.simulators.mechanisms import Mechanism
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)  # quantiles of the prior at which a shape is tried
 LEVELS_OF_TWO = (0.2, 0.5, 0.8)  # if there are two of them
-CROSSED = 2  # shapes without a grid of their own that have a full grid
+CROSSED = 2  # shapes with the same grid, or without a grid of their own, that are tried in every combination
 WAY = np.geomspace(0.05, 1.5, 12)  # shares of the path from null to a trial shape
 NEIGHBOURS = 1.001  # a ladder that is no wider is not divided again: it ends after four divisions at the most
 SIZES = np.geomspace(0.03, 3.0, 12)  # of an amplitude, in prior deviations; the slope at null shows small sizes
@@ -97,9 +97,9 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
 
     A parameter without visible effect at null is a shape (a time constant, a threshold). Its prior is tried on a grid.
     If the shape alone changes the data visibly, that change is the direction; otherwise the amplitudes are
-    differentiated at the trial value. Rounding of a solver is an effect, too, but not a visible one. Shapes without a
-    grid of their own are tried at the same quantile if there are more than two: a full grid of 63 offsets would have
-    3^63 points.
+    differentiated at the trial value. Rounding of a solver is an effect, too, but not a visible one. More than two
+    shapes with the same grid, or without a grid of their own, move along it together: every combination of 63 offsets
+    would be 3^63 points.
     """
     base, coordinates = span(fit.jacobian), target.forward.coordinates
     open_ = [c for c in candidates if c.indices]
@@ -122,16 +122,14 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
             probes.append(_probe(target, base, candidate, {}, columns, candidate.indices))
             continue
         levels = LEVELS if len(shapes) < 2 else LEVELS_OF_TWO
-        values = {
-            i: coordinates.encode_one(i, grids[i]) if grids[i] else coordinates.quantiles(i, levels) for i in shapes
-        }
-        crossed = [i for i in shapes if grids[i] or len(shapes) <= CROSSED]
-        together = [i for i in shapes if i not in crossed]
-        axes = [[{i: value} for value in values[i]] for i in crossed]
-        if together:
-            axes.append(
-                [dict(zip(together, row, strict=True)) for row in zip(*(values[i] for i in together), strict=True)]
-            )
+        axes: list[list[dict[int, float]]] = []
+        for grid in dict.fromkeys(grids[i] for i in shapes):
+            alike = [i for i in shapes if grids[i] == grid]
+            values = [coordinates.encode_one(i, grid) if grid else coordinates.quantiles(i, levels) for i in alike]
+            if len(alike) <= CROSSED:
+                axes += [[{i: value} for value in own] for i, own in zip(alike, values, strict=True)]
+            else:
+                axes.append([dict(zip(alike, row, strict=True)) for row in zip(*values, strict=True)])
         jobs += [(candidate, {k: v for part in parts for k, v in part.items()}) for parts in product(*axes)]
     return probes + _probe_grid(target, fit, base, jobs)
 

@@ -167,15 +167,20 @@ class Stopped(Toy):
 
 
 class Faint(Toy):
-    """The toy with a family of eight parameters, whose effects no recording can show one by one."""
+    """The toy with two families of eight parameters, one with a grid; no recording can show a parameter by itself."""
 
-    added = types.MappingProxyType({"faint": tuple(spec(f"faint_{k}") for k in range(8))})
-    parameters = (*Toy.parameters, *added["faint"])
+    added = types.MappingProxyType(
+        {
+            "faint": tuple(spec(f"faint_{k}") for k in range(8)),
+            "stepped": tuple(spec(f"stepped_{k}", grid=(0.5, 1.0, 2.0)) for k in range(8)),
+        }
+    )
+    parameters = (*Toy.parameters, *added["faint"], *added["stepped"])
 
     def rollout(self, parameters, commands, steps=None):
         seen = super().rollout(parameters, commands, steps)
         level = jnp.concatenate([commands.initial[None], commands.step])[:, 1, None, None]
-        size = 5e-4 * sum(parameters.get(each.name, 0.0) for each in self.added["faint"])
+        size = 5e-4 * sum(parameters.get(each.name, 0.0) for family in self.added.values() for each in family)
         return seen._replace(position=seen.position + size * level * FURTHER[0])
 
 
