@@ -90,8 +90,9 @@ def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
     return "; ".join(f"w({port}) = {' + '.join(own)}" for port, own in parts.items())
 
 
-def law_sentence(answer: Answer) -> str:
-    """Port, time, law, gain, and check at the robot."""
+def law_sentence(answer: Answer, *, first: bool) -> str:
+    """Port, time, law, gain, and check at the robot; ``first`` if no sentence about mechanisms of the library precedes
+    it."""
     described = answer.law
     assert described is not None
     assert described.gain is not None
@@ -101,10 +102,12 @@ def law_sentence(answer: Answer) -> str:
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
     unknown = "no mechanism of the library describes" if answer.problem.candidates else "the model lacks"
-    head = f"An effect acts that {unknown}: {laws}{_when(described, answer.problem.timed)}"
-    worth = f"it explains {gain.share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
+    acts, of = ("An effect acts", "of the discrepancy") if first else ("A smaller effect acts", "of what is left")
+    head = f"{acts} that {unknown}: {laws}{_when(described, answer.problem.timed)}"
+    worth = f"it explains {gain.share} {of} in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
     looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.search.terms))
-    return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."
+    beside = _beside(described) if first else ""
+    return f"{head}; {worth}.{_stand_ins(described)}{beside}{_ties(described, names)} Look at {looks}."
 
 
 def _one(refit: Refit, row: dict[str, Any], names: Sequence[str]) -> str:

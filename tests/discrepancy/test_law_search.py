@@ -119,9 +119,9 @@ def searched(toy, alike=False):
     return question, target, base, law_search(target, *options).find(target, base)
 
 
-def asked(seed, toy=None, alike=False):
+def asked(seed, toy=None, alike=False, truth=TRUTH):
     """The audit of the plain toy on recordings of another one."""
-    plain, trajectories = problem({}, seed), recordings(TRUTH, seed, toy, alike=alike)
+    plain, trajectories = problem({}, seed), recordings(truth, seed, toy, alike=alike)
     gathered = gather_recordings(Toy(), trajectories)
     model = replace(plain.model, recordings=gathered, channels=(Markers.gather(gathered, "repeats"),))
     return replace(
@@ -157,6 +157,21 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert float((left.residual_last**2).mean()) < float((left.residual_base**2).mean())
     assert left.signal.sel(port="marker m3 x").shape == (2, left.sizes["signal_time"])
     assert "Law and port" in render_audit(shown(answer), content, "toy", "")
+
+
+@pytest.mark.slow
+def test_a_mechanism_that_takes_more_away_than_the_law_beside_it_is_said_first():
+    answer = audit(asked(5, Pushed(), truth={**TRUTH, "play": 8.0}))
+    words = record(answer, versions={}, data_sha256="", next_experiment=None)["sentence"]
+    assert answer.verdict == "described"
+    assert answer.law.beside == ("play",)
+    assert words.startswith("Play (")
+    assert words.index("of the discrepancy in unseen") < words.index("A smaller effect acts") < words.index("marker m3")
+    assert words.index("marker m3") < words.index("of what is left in unseen recordings")
+    swapped = replace(answer.validation, gain=replace(answer.validation.gain, rmse_base=answer.law.gain.rmse_base))
+    law_first = record(replace(answer, validation=swapped), versions={}, data_sha256="", next_experiment=None)["sentence"]
+    assert law_first.startswith("An effect acts")
+    assert "Beside it, play of the library" in law_first
 
 
 @pytest.mark.parametrize(("left", "said"), [(1.0, "at marker tip x, of 0.002 m"), (30.0, "at marker tip x explains")])
