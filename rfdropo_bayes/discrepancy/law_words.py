@@ -91,8 +91,7 @@ def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
 
 
 def law_sentence(answer: Answer, *, first: bool) -> str:
-    """Port, time, law, gain, and check at the robot; ``first`` if no sentence about mechanisms of the library precedes
-    it."""
+    """Port, time, law, gain, and check at the robot; ``first`` without an earlier sentence about mechanisms."""
     described = answer.law
     assert described is not None
     assert described.gain is not None
@@ -105,7 +104,7 @@ def law_sentence(answer: Answer, *, first: bool) -> str:
     acts, of = ("An effect acts", "of the discrepancy") if first else ("A smaller effect acts", "of what is left")
     head = f"{acts} that {unknown}: {laws}{_when(described, answer.problem.timed)}"
     worth = f"it explains {gain.share} {of} in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
-    looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.search.terms))
+    looks = "; ".join(dict.fromkeys(refit.term.port.look for refit in described.search.terms))
     beside = _beside(described) if first else ""
     return f"{head}; {worth}.{_stand_ins(described)}{beside}{_ties(described, names)} Look at {looks}."
 
@@ -153,7 +152,8 @@ def _beside(described: Described) -> str:
 
 
 def _ties(described: Described, names: Sequence[str]) -> str:
-    ties = described.search.ties[:MOST_TIES]
+    own = {refit.term.place for refit in described.search.terms}
+    ties = [tie for tie in described.search.ties if tie.term.place not in own][:MOST_TIES]
     if not ties:
         return ""
     listed = ", ".join(

@@ -159,19 +159,42 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert "Law and port" in render_audit(shown(answer), content, "toy", "")
 
 
+BOTH = {**TRUTH, "play": 8.0}  # a mechanism of the library, whose effect is larger than the push of marker m3
+
+
 @pytest.mark.slow
 def test_a_mechanism_that_takes_more_away_than_the_law_beside_it_is_said_first():
-    answer = audit(asked(5, Pushed(), truth={**TRUTH, "play": 8.0}))
-    words = record(answer, versions={}, data_sha256="", next_experiment=None)["sentence"]
+    answer = audit(asked(5, Pushed(), truth=BOTH))
+
+    def said(changed):
+        content = record(changed, versions={}, data_sha256="", next_experiment=next_experiment(changed))
+        return content["sentence"], content["next_experiment"]["sentence"]
+
+    words, following = said(answer)
     assert answer.verdict == "described"
     assert answer.law.beside == ("play",)
     assert words.startswith("Play (")
     assert words.index("of the discrepancy in unseen") < words.index("A smaller effect acts") < words.index("marker m3")
     assert words.index("marker m3") < words.index("of what is left in unseen recordings")
-    swapped = replace(answer.validation, gain=replace(answer.validation.gain, rmse_base=answer.law.gain.rmse_base))
-    law_first = record(replace(answer, validation=swapped), versions={}, data_sha256="", next_experiment=None)["sentence"]
-    assert law_first.startswith("An effect acts")
-    assert "Beside it, play of the library" in law_first
+    assert following.startswith("Check play on the robot")
+    less = replace(answer.validation.gain, rmse_base=answer.law.gain.rmse_base)
+    words, following = said(replace(answer, validation=replace(answer.validation, gain=less)))
+    assert words.startswith("An effect acts")
+    assert "Beside it, play of the library" in words
+    assert "whether marker m3" in following
+
+
+@pytest.mark.slow
+def test_no_law_is_sought_for_less_than_matters():
+    """The same recordings: what the play leaves is below a stated limit."""
+    given = asked(5, Pushed(), truth=BOTH)
+    left = 3e-3  # [m]
+    answer = audit(replace(given, rules=replace(given.rules, matters=left)))
+    assert answer.verdict == "explained"
+    assert [step.name for step in answer.steps] == ["play"]
+    assert answer.described is None
+    assert answer.test_series[-1].omnibus.p <= given.rules.extended_passes
+    assert np.sqrt(3.0) * answer.remainder.amplitude < left
 
 
 @pytest.mark.parametrize(("left", "said"), [(1.0, "at marker tip x, of 0.002 m"), (30.0, "at marker tip x explains")])
