@@ -458,4 +458,4 @@ def _noise_in_words(target: FitTarget, fit: Fit) -> str:
         float(np.mean((deviation / target.noise.first.scale) ** 2)),
     )
     white = f"white noise of {size:.2g} mm, the size of its residuals"
-    return f"{words}; it is misspecified: {white}; a row counts {share:.2g}"
+    return f"{words}; it is misspecified: {white}; a row is worth {share:.2g} of an independent row"
