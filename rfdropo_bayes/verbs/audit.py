@@ -141,8 +141,9 @@ def audit(
     doubts = cautions_of_audit(model, [*runs, *test], fitted_paths(problem, start or {}))
 
     def audited(out: Path | None) -> Audit:
-        journal = None if out is None else Journal(out / JOURNAL, resume=resume)
-        answer = ask(problem, say_lines(show), journal, deadline)
+        journal, report = None if out is None else Journal(out / JOURNAL, resume=resume), say_lines(show)
+        report(f"takes at most {table.minutes:g} minutes ([audit] minutes), or ends earlier")
+        answer = ask(problem, report, journal, deadline)
         data = combined_hash([trajectory.sha256 for trajectory in [*runs, *test]])
         return _audited(answer, model, tables, data, out, doubts)
 
