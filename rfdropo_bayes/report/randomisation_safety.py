@@ -125,8 +125,8 @@ def _near_baselines(summary: Mapping[str, Any], errors: Mapping[str, float]) -> 
         best = best_baseline(summary, "test", marker)
         noise = floor[marker] ** 2 if floor.get(marker) else error**2 * (1.0 - max(correlation[marker] or 0.0, 0.0))
         if best is not None and error**2 - noise > HALF * max(best[1] ** 2 - noise, 0.0):
-            places.append(f"{error:.3g} against {best[1]:.3g} mm at {_place(marker, errors)}")
-    what = "beside its noise, the error is more than half of the squared error of a predictor without physics"
+            places.append(f"{error:.3g} mm against {best[1]:.3g} mm at {_place(marker, errors)}")
+    what = "less the noise, its squared error is more than half of that of the best predictor without physics"
     return [f"{what} ({', '.join(places)})"] if places else []
 
 

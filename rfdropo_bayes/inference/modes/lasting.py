@@ -143,8 +143,8 @@ def lasting_cautions(lasting: Mapping[str, Lasting]) -> list[Caution]:
     return [
         Caution(
             Code.RESIDUALS_LAST,
-            f"residuals of the {name} are correlated over {each.rows:.2g} rows and between coordinates: a "
-            f"row counts {each.share:.2g}; rfdropo audit can find the effect that the simulator lacks",
+            f"residuals of the {name} are correlated over {each.rows:.2g} rows and between coordinates: a row is "
+            f"worth {each.share:.2g} of an independent row; rfdropo audit can find the effect that the simulator lacks",
         )
         for name, each in lasting.items()
         if each.share < WIDER**-2
