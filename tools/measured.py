@@ -82,6 +82,12 @@ def asl_days() -> list[tuple[float, float]]:
     return [(1e3 * error, row["over_time"]) for error, row in zip(sessions.values(), held.values(), strict=True)]
 
 
+def laws() -> dict[str, Mapping[str, Any]]:
+    """Share of audits of effects outside the library with the right port, and with the right kind of law."""
+    lines = read_lines(REPORTS / "unknown_effects" / "rod" / "ledger.jsonl")
+    return {key: counted(sum(line[f"{key}_right"] for line in lines), len(lines)) for key in ("port", "law")}
+
+
 def sizes() -> Mapping[str, Any]:
     """Share of 90 % intervals that hold the size, given the right cause."""
     learnt = [size for line in read_lines(REPORTS / "size_coverage" / "rod.jsonl") for size in line.get("sizes", [])]
@@ -136,6 +142,7 @@ def page() -> str:
         asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
         motion=audits("audit_power/unknown_scale/datasets.jsonl"),
+        laws=laws(),
         sizes=sizes(),
         inferred=table1("rod"),
         trunk=json.loads((REPORTS / "sim2real_trunk" / "summary.json").read_text(encoding="utf-8")),
