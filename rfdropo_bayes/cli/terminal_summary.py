@@ -54,7 +54,7 @@ def show_calibration(calibration: Calibration, experiment: Path | None = None) -
             console.print(f"left out: {seen['masked']} of {seen['positions']} positions", soft_wrap=True)
         for sentence in summary["details"].get("compared", ()):
             console.print(sentence, soft_wrap=True)
-    ready = experiment is None or calibration.verdict == "safe"
+    ready = experiment is None or (calibration.verdict == "safe" and not calibration.cautions)
     words = (
         ["predict", str(folder), "--commands", "FILE"] if ready else ["audit", str(experiment), "--from", str(folder)]
     )
@@ -116,6 +116,11 @@ def show_prediction(facts: Mapping[str, Any], files: Sequence[Path]) -> None:
         lines.append(f"group {facts['group']}, {values}")
     if facts.get("unseen_session"):
         lines.append(facts["unseen_session"])
+    if facts.get("compared"):
+        found = facts["compared"]
+        errors = ", ".join(f"{error:.3g} mm at {name}" for name, error in reversed(found["rms_mm"].items()))
+        held = f"the 90 % bands hold {100.0 * found['in_90_percent_bands']:.0f} % of the coordinates"
+        lines.append(f"beside the {found['rows']} later rows of the file, off by {errors} (root mean square); {held}")
     lines += [f"caution: {caution['sentence']}" for caution in facts["cautions"]]
     lines += ["mean, 50 and 90 % bands in m:", *(f"  {file}" for file in files)]
     typer.echo("\n".join(lines))

@@ -32,7 +32,19 @@ def load_unseen(
     begun: str | None = None,
     episode: int | None = None,
 ) -> Trajectory:
-    """The commands of a file in the format of an experiment, and its start pose.
+    """The commands of a file in the format of an experiment, and its start pose; see `load_commanded`."""
+    return first_row_only(load_commanded(spec, base, commands, start, begun, episode))
+
+
+def load_commanded(
+    spec: DataSpec,
+    base: Path,
+    commands: str,
+    start: str | None = None,
+    begun: str | None = None,
+    episode: int | None = None,
+) -> Trajectory:
+    """The commands of a file in the format of an experiment, with the measurements that the file has.
 
     Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv", and
     formats whose columns [data.columns] names with a CSV of commands alone, take it from the first row of ``start``, or
@@ -54,7 +66,7 @@ def load_unseen(
     if spec.format == "asl-csv":
         observations = None if start is None else find_data_file(start, base)
         whole = read_asl_start(find_data_file(commands, base), observations)
-        return first_row_only(spec.piece(_begun(whole, spec, begun), None))
+        return spec.piece(_begun(whole, spec, begun), None)
     if spec.columns is not None:
         folders = spec.format in FOLDERS
         path = find_files(commands, base, folders=folders)[0]
@@ -83,7 +95,7 @@ def load_unseen(
     recordings = load_recordings(changed(spec, where="[data]", **changes), base)
     if len(recordings) > 1:
         raise one_at_a_time(spec, commands, len(recordings), "predict")
-    return first_row_only(spec.piece(_begun(recordings[0], spec, begun), None))
+    return spec.piece(_begun(recordings[0], spec, begun), None)
 
 
 def one_at_a_time(spec: DataSpec, name: str, number: int, verb: str) -> InputError:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from rfdropo_bayes.bayes.noise.autoregression import REPEATS
 from rfdropo_bayes.cautions import Caution
@@ -27,6 +28,7 @@ SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
 FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
+FAMILY, SHARPER = 3, 0.5  # fewest members with a median; deviation of differences over that of members
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
 REFINE = "raise [simulator] refine and, if the robot moves, shorten time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
@@ -41,6 +43,7 @@ def record(
     """
     first = answer.test_series[0]
     refits = answer.steps[0].refits if answer.steps else answer.refits
+    refits = {step.name: step.log_bayes_factor for step in answer.steps} | refits
     findings = [_finding(answer, step, stage) for step, stage in zip(answer.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
     measured = answer.target.measurements
@@ -228,6 +231,7 @@ def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]
     if candidate is not None:
         parameters = _drawn_parameters(answer, candidate.indices)
         relative = relative_sizes(answer.problem.coordinates, answer.sizes, candidate.indices)
+        relative = relative or differences(answer.problem.coordinates, answer.draws, candidate.indices)
     return {
         "mechanism": candidate.title if candidate else step.name,
         "group": candidate.group if candidate else "",
@@ -315,6 +319,33 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
             "unit": f"{unit}/Pa" if power > 0 else f"{unit} Pa",
         }
     return sizes
+
+
+def differences(coordinates: Coordinates, draws: Float[np.ndarray, "draw d"], indices: Sequence[int]) -> dict[str, Any]:
+    """Members of a family less their median, if the data determine these differences much better than the members.
+
+    A base parameter may act as all members together: a gain of all drives beside gains of single cables.
+    """
+    parameters = [coordinates.space.parameters[i] for i in indices]
+    if len(indices) < FAMILY or len({each.spec.unit for each in parameters}) > 1:
+        return {}
+    values = coordinates.values(draws)[:, list(indices)]
+    apart = values - np.median(values, axis=1, keepdims=True)
+    if np.mean(apart.var(axis=0)) > SHARPER**2 * np.mean(values.var(axis=0)):
+        return {}
+    return {
+        f"{coordinates.names[i]}_less_median": {
+            "title": f"{each.spec.name}_less_median",
+            "parameter": coordinates.names[i],
+            "power": 0,
+            "mean": float(column.mean()),
+            "sd": float(column.std()),
+            "q05": float(np.quantile(column, 0.05)),
+            "q95": float(np.quantile(column, 0.95)),
+            "unit": each.spec.unit,
+        }
+        for i, each, column in zip(indices, parameters, apart.T, strict=True)
+    }
 
 
 def _where(answer: Answer) -> dict[str, Any]:

@@ -108,8 +108,13 @@ def noise_share(fit_target: FitTarget) -> float:
 
 
 def residual_deviation(fit_target: FitTarget, fit: Fit) -> Float[np.ndarray, " column"]:
-    """Deviation of a fit's residuals for each column: the measurement noise, unless the model is misspecified."""
-    return fit_target.noise.scale if fit_target.known is None else _sizes(fit_target, _errors(fit_target, fit.residual))
+    """Deviation of a fit's residuals for each column: the measurement noise, unless the model is misspecified, or the
+    noise is the residuals' of another model."""
+    if fit_target.known is not None:
+        return _sizes(fit_target, _errors(fit_target, fit.residual))
+    if fit_target.noise.source == RESIDUALS:
+        return _sizes(fit_target, fit_target.errors(fit.x))
+    return fit_target.noise.scale
 
 
 def _errors(

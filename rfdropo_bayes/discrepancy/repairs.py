@@ -132,7 +132,7 @@ def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tu
             search.report(f"{step.name} is no longer needed")
             return simplified(search, base, without(search, steps, index, base))
         if simpler:
-            search.report(f"in the place of {step.name}: refitting {len(simpler)} simpler candidates")
+            search.report(f"in the place of {step.name}: refitting {', '.join(c.name for c in simpler)}")
         probes = probe_all(search.target, empty, simpler)
         tests = run_score_tests(
             search.target, empty, probes, [c.name for c in simpler], [search.seed, index], search.rules.bootstraps

@@ -203,7 +203,7 @@ class CableGain(MemorylessActuation):
     stage = "actuation"
     inside_drive = False
     cause = "spools of different radius, cables of different stretch, or a cable that slips or is torn"
-    remedy = "measure the travel of each cable for one turn of its drive"
+    remedy = "measure how far each cable travels for the same command"
 
     def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
         self.parameters = tuple(

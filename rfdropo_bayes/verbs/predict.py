@@ -21,7 +21,7 @@ from rfdropo_bayes.data import (
     Trajectory,
     commands_alone,
     first_row_only,
-    load_unseen,
+    load_commanded,
     start_is_known,
 )
 from rfdropo_bayes.data.given_recordings import given_recording
@@ -69,7 +69,7 @@ def predict(
         commands: a recording, of which only the commands and the first row are used; the name of a file in the format
             of the model's experiment; or a pair of times [s] and commands (time, channel), in the robot's unit.
         start: positions of the markers in the first row [m], (marker, 3), if commands are a pair; if commands are a
-            file without observations, the file that has them (see `load_unseen`); unknown by default.
+            file without observations, the file that has them (see `load_commanded`); unknown by default.
         episode: number of the episode, if the file is a LeRobotDataset.
         draws: number of posterior draws to simulate.
         seed: seed of random numbers; by default from the model's experiment.
@@ -94,7 +94,7 @@ def predict(
     if isinstance(commands, tuple) and len(commands) == 2 and not isinstance(commands[0], Trajectory):
         times, values = (np.asarray(part, dtype=float) for part in commands)
         names, unit = model.simulator.channel_names, model.simulator.command_unit
-        unseen = commands_alone(
+        given = commands_alone(
             Origin("commands", model.name, "memory"),
             SentCommands(times, values, unit, names).trusted(),
             model.simulator.marker_names,
@@ -106,9 +106,10 @@ def predict(
             remedy = "name the format of the commands"
             raise InputError("the experiment has no [data]", where=path, remedy=remedy)
         begun = record.attrs.get(BEGUN)
-        unseen = load_unseen(data, model.folder, str(commands), start, begun=begun, episode=episode)
+        given = load_commanded(data, model.folder, str(commands), start, begun=begun, episode=episode)
     else:
-        unseen = first_row_only(given_recording(commands, "predict"))
+        given = given_recording(commands, "predict")
+    unseen = first_row_only(given)  # a prediction knows no later row
     asked = {"group": group, "seed": seed, "episode": episode}
     group = record.attrs.get(ADAPTED_TO) if group is None else group
     groups = spec.groups if group is None else in_group(unseen.name, group, spec.groups)
@@ -149,6 +150,7 @@ def predict(
         "episode": episode,
         "start_pose_known": start_is_known(unseen),
         "first_command": unseen.first_command,
+        "compared": compared(given, predicted, bands),
         "simulator": model.simulator.description,
     }
     prediction = Prediction(bands, predicted, group, group in known if known else None, cautions, "".join(said), facts)
@@ -159,6 +161,20 @@ def predict(
     with run_folder(Path(out), "predict", **settings, options=options, overwrite=overwrite) as folder:
         prediction.save(folder)
     return prediction
+
+
+def compared(measured: Trajectory, predicted: RecordingPrediction, bands: xr.Dataset) -> dict[str, Any] | None:
+    """The prediction beside the rows that the file has after the first: root mean square distance [mm] of each marker,
+    and share of the measured coordinates in the 90 % bands; None if no later row has a marker."""
+    seen = measured.position_mask.copy()
+    seen[0] = False
+    if not seen.any():
+        return None
+    square = np.sum((measured.position - predicted.central) ** 2, axis=-1)
+    rows = zip(predicted.marker_names, square.T, seen.T, strict=True)
+    errors = {name: 1e3 * float(np.sqrt(np.mean(own[there]))) for name, own, there in rows if there.any()}
+    inside = (measured.position >= bands["q05"].values) & (measured.position <= bands["q95"].values)
+    return {"rms_mm": errors, "in_90_percent_bands": float(np.mean(inside[seen])), "rows": int(seen.any(axis=1).sum())}
 
 
 def _slow_error(

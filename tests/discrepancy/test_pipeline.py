@@ -22,7 +22,7 @@ from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.data import Trajectory
 from rfdropo_bayes.discrepancy import base_fit
 from rfdropo_bayes.discrepancy import held_out as held_out_module
-from rfdropo_bayes.discrepancy.audit_record import _doubt, next_experiment, record
+from rfdropo_bayes.discrepancy.audit_record import _doubt, differences, next_experiment, record
 from rfdropo_bayes.discrepancy.base_fit import base_model, first_target
 from rfdropo_bayes.discrepancy.candidates import lead, probe_all
 from rfdropo_bayes.discrepancy.deadline import Deadline
@@ -757,6 +757,27 @@ def test_of_many_sizes_the_surest_are_said_in_their_order():
     sizes = {f"size_{k}": {"title": f"size_{k}", "mean": float(m), "sd": 1.0, "unit": "m"} for k, m in means}
     finding = {"mechanism": "glue", "group": "", "parameters": sizes, "relative": {}, "equivalence_class": ["glue"]}
     assert re.findall(r"size (\d)", _named(finding)) == ["1", "2", "4", "5"]
+
+
+@pytest.mark.parametrize("common", [0.07, 0.001])
+def test_a_member_of_a_family_is_said_beside_the_others_if_only_that_is_known(common):
+    """Gains of four cables beside a gain of all drives: the first is 12 % off the others to .3 %, and by itself to
+    the deviation of what is common."""
+    rng = np.random.default_rng(0)
+    draws = np.array([-0.12, 0.0, 0.0, 0.0]) + 0.003 * rng.normal(size=(2000, 4)) + common * rng.normal(size=(2000, 1))
+    specs = [SimpleNamespace(name=f"gain_{k}", unit="-") for k in range(4)]
+    space = SimpleNamespace(parameters=[SimpleNamespace(spec=each) for each in specs])
+    coordinates = SimpleNamespace(space=space, names=[each.name for each in specs], values=lambda points: points)
+    found = differences(coordinates, draws, range(4))
+    if common < 0.003:
+        assert found == {}
+        return
+    assert found["gain_0_less_median"]["mean"] == pytest.approx(-0.12, abs=3e-3)
+    assert found["gain_0_less_median"]["sd"] < 0.005
+    assert differences(coordinates, draws, range(2)) == {}
+    sizes = {s.name: {"title": s.name, "mean": -0.1, "sd": common, "unit": "-"} for s in specs}
+    finding = {"mechanism": "gain", "group": "", "parameters": sizes, "relative": found, "equivalence_class": ["gain"]}
+    assert _named(finding).startswith("gain (gain 0 less median -0.119 ")
 
 
 def test_a_tie_with_the_same_mechanism_in_another_group_is_said():

@@ -86,7 +86,7 @@ def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
     [
         (lambda s: s["noise_floor_mm"].update(tip=0.1), "where repeats differ by 0.1 mm"),
         (lambda s: s["error_correlation"]["test"].update(tip=0.83), "correlation 0.83 at the tip"),
-        (lambda s: s["rmse"]["test"].update(middle=0.88), "0.88 against"),
+        (lambda s: s["rmse"]["test"].update(middle=0.88), "0.88 mm against"),
     ],
 )
 def test_errors_that_no_noise_explains_ask_for_care(run, summary, change, words):

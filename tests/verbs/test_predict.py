@@ -90,6 +90,15 @@ def test_only_the_first_row_is_seen_and_sets_the_frame(posterior, tmp_path):
             there[name].values - here[name].values, np.broadcast_to(SHIFT, here[name].shape), atol=1e-7
         )
         np.testing.assert_array_equal(blind[name].values, there[name].values)
+    said = [json.loads((tmp_path / name / "prediction.json").read_text())["compared"] for name in "abc"]
+    assert said[2] is None  # no later row has a marker
+    assert said[0]["rows"] == 30
+    off = here["mean"].values[1:] - whole.position[1:31]
+    expected = 1e3 * np.sqrt(np.mean(np.sum(off**2, axis=-1), axis=0))
+    np.testing.assert_allclose(list(said[0]["rms_mm"].values()), expected, rtol=1e-9)
+    assert said[1]["rms_mm"] == pytest.approx(said[0]["rms_mm"])
+    inside = (here["q05"].values[1:] <= whole.position[1:31]) & (whole.position[1:31] <= here["q95"].values[1:])
+    assert said[0]["in_90_percent_bands"] == pytest.approx(inside.mean())
     start = here["mean"].values[0] - whole.position[0]
     np.testing.assert_allclose(start.mean(axis=0), 0.0, atol=1e-9)
 
