@@ -57,6 +57,8 @@ class Code(StrEnum):
     """Parameters that some groups alone have: a group that no fit has seen is taken to be without them."""
     UNSAFE_POSTERIOR = "unsafe_posterior"
     """A policy is trained on a posterior that its own record, or an audit of its recordings, speaks against."""
+    RECORDINGS_ONLY = "recordings_only"
+    """Values of a parameter that only recordings can have, and no policy can meet."""
     RECORDING_DOUBTFUL = "recording_doubtful"
     """Rows, names or values of a recording were probably misread, or copied, or moved by something else."""
     FRAME_DOUBTFUL = "frame_doubtful"

@@ -18,7 +18,7 @@ ANGLES = ("deg", "rad", "counts")
 PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
 UNITS = ("mm", "cm", "m", "in", *ANGLES, *PASCALS, *FORCES)
-FOUND = ("axes = ", "origin = ", "commands = ", "commands_with_poses = ", "unwrap = ", "[model.groups]")
+FOUND = ("test = ", "axes = ", "origin = ", "commands = ", "commands_with_poses = ", "unwrap = ", "[model.groups]")
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3

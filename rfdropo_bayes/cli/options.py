@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
 
@@ -81,6 +82,12 @@ def see_calibration(folder: Path | None, option: str) -> None:
 
 
 def same_command(name: str, *further: str) -> str:
-    """The command line that the program ``name`` was called with, and further options."""
-    kept = [argument for argument in sys.argv[1:] if argument not in ("--resume", "--overwrite")]
+    """The command line that the program ``name`` was called with, and further options; ``--set KEY=`` among them
+    replaces an earlier value of the key."""
+    arguments = sys.argv[1:]
+    keys = tuple(f"{option.split('=')[0]}=" for option in further if "=" in option)
+    again = {k for k, (one, two) in enumerate(pairwise(arguments)) if one == "--set" and two.startswith(keys)}
+    dropped = {k for k, argument in enumerate(arguments) if argument in ("--resume", "--overwrite")}
+    dropped |= again | {k + 1 for k in again}
+    kept = [argument for k, argument in enumerate(arguments) if k not in dropped]
     return shlex.join([*name.split(), *kept, *further])

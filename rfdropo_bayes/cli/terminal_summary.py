@@ -27,7 +27,7 @@ COLOURS = {
     "partly_explained": FAIR,
     "unexplained": BAD,
 }
-MOST_ROWS = 20
+MOST_ROWS = 40
 
 
 def show_calibration(calibration: Calibration, experiment: Path | None = None) -> None:

@@ -141,8 +141,8 @@ def next_experiment(answer: Answer) -> dict[str, Any]:
         words = "No change is needed for commands like these; record larger and faster commands, and audit them."
     elif answer.verdict == NEGLIGIBLE:
         words = "Nothing need be done: the residual is too small to matter."
-    elif answer.law is not None:
-        looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.search.terms))
+    elif answer.law is not None and answer.law_leads:
+        looks = "; ".join(dict.fromkeys(refit.term.port.look for refit in answer.law.search.terms))
         words = f"Look at {looks}: the library has no mechanism that acts so."
     elif not answer.fitted:
         words = "Nothing yet: raise [audit] minutes and go on with --resume, or start anew from a calibration (--from)."

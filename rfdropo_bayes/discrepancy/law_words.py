@@ -90,8 +90,8 @@ def formula(terms: Sequence[Refit], names: Sequence[str]) -> str:
     return "; ".join(f"w({port}) = {' + '.join(own)}" for port, own in parts.items())
 
 
-def law_sentence(answer: Answer) -> str:
-    """Port, time, law, gain, and check at the robot."""
+def law_sentence(answer: Answer, *, first: bool) -> str:
+    """Port, time, law, gain, and check at the robot; ``first`` without an earlier sentence about mechanisms."""
     described = answer.law
     assert described is not None
     assert described.gain is not None
@@ -101,10 +101,12 @@ def law_sentence(answer: Answer) -> str:
     errors = f"{MILLIMETRES * gain.rmse_base:.3g} mm without it, {MILLIMETRES * gain.rmse_extended:.3g} mm with it"
     noise = MILLIMETRES * noise_distance(answer.target.noise.first)
     unknown = "no mechanism of the library describes" if answer.problem.candidates else "the model lacks"
-    head = f"An effect acts that {unknown}: {laws}{_when(described, answer.problem.timed)}"
-    worth = f"it explains {gain.share} of the discrepancy in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
-    looks = " and ".join(dict.fromkeys(refit.term.port.look for refit in described.search.terms))
-    return f"{head}; {worth}.{_stand_ins(described)}{_beside(described)}{_ties(described, names)} Look at {looks}."
+    acts, of = ("An effect acts", "of the discrepancy") if first else ("A smaller effect acts", "of what is left")
+    head = f"{acts} that {unknown}: {laws}{_when(described, answer.problem.timed)}"
+    worth = f"it explains {gain.share} {of} in unseen recordings ({errors}, {noise:.2g} mm of it noise)"
+    looks = "; ".join(dict.fromkeys(refit.term.port.look for refit in described.search.terms))
+    beside = _beside(described) if first else ""
+    return f"{head}; {worth}.{_stand_ins(described)}{beside}{_ties(described, names)} Look at {looks}."
 
 
 def _one(refit: Refit, row: dict[str, Any], names: Sequence[str]) -> str:
@@ -150,7 +152,8 @@ def _beside(described: Described) -> str:
 
 
 def _ties(described: Described, names: Sequence[str]) -> str:
-    ties = described.search.ties[:MOST_TIES]
+    own = {refit.term.place for refit in described.search.terms}
+    ties = [tie for tie in described.search.ties if tie.term.place not in own][:MOST_TIES]
     if not ties:
         return ""
     listed = ", ".join(

@@ -63,6 +63,7 @@ class Results:
     kept: Kept | None = None
     suspected: Stacked | None = None
     described: Described | None = None
+    small: bool = False  # whether what the named causes leave is negligible
     ended: tuple[str, ...] = ()
 
     def after(self, part: str) -> Results:
@@ -210,6 +211,15 @@ class Answer:
         return self.described if self.described is not None and self.described.holds else None
 
     @property
+    def law_leads(self) -> bool:
+        """Whether a law takes more of the squared error of unseen recordings away than the mechanisms beside it."""
+        named, law = self.validation.gain, self.law and self.law.gain
+        if law is None or named is None or not self.steps:
+            return law is not None
+        taken, by_law = (gain.rmse_base**2 - gain.rmse_extended**2 for gain in (named, law))
+        return by_law >= taken
+
+    @property
     def adopted(self) -> list[Added]:
         """Adopted steps: clearly supported by unseen recordings, in a model with a noticeable explained share."""
         gain = self.validation.gain
@@ -283,7 +293,9 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
         kept = replace(kept, named=replace(last, tests=tests))
     results = replace(results, kept=kept).after(GAIN)
     yield results
-    verdict = _verdict(kept, problem, ended=True)
+    small = bool(kept.named.steps) and _leaves_little(problem, kept.named)
+    results = replace(results, small=small)
+    verdict = _verdict(kept, problem, ended=True, small=small)
     passes = kept.named.test_series[-1].omnibus.p > problem.rules.extended_passes
     if verdict in (PARTLY, UNEXPLAINED) and not passes:
         stated = search.target.measured
@@ -314,7 +326,8 @@ def conclude(results: Results, report: Callable[[str], None] = lambda line: None
     base = as_measured(fit_target, fitted.base)
     steps = [replace(step, fit=as_measured(step.fit_target, step.fit)) for step in fitted.steps]
     test_series, validation = fitted.test_series, Validation.of_steps(kept.held_out, len(steps))
-    verdict, described = _verdict(kept, problem, ended=CAUSES in results.ended), results.described
+    verdict = _verdict(kept, problem, ended=CAUSES in results.ended, small=results.small)
+    described = results.described
     if described is not None and described.holds:
         verdict = DESCRIBED
         if len(described.steps) < len(steps):
@@ -381,13 +394,29 @@ def _kept_in_time(results: Results, clock: Deadline) -> Kept:
     return kept
 
 
-def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool) -> str:
-    """The verdict on the named causes alone; ``ended`` is whether all candidates were tested."""
+def _leaves_little(problem: AuditProblem, named: Named) -> bool:
+    """Whether the residual beside the named causes is negligible."""
+    target, fit = named.search.target.measured, as_measured(named.fit_target, named.fit)
+    finer = None if DISCRETISATION in named.names else named.search.finer
+    noise, left = target.noise.first, describe_remainder(target.measurements, fit.residual, target.noise.first)
+    numerical = None if finer is None else numerical_shift(target, finer, fit)
+    return negligible(problem.rules, float(np.sqrt(3.0) * left.amplitude), noise_distance(noise), numerical)
+
+
+def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool, small: bool) -> str:
+    """The verdict on the named causes alone.
+
+    Args:
+        kept: named causes.
+        problem: problem with the rules.
+        ended: whether all candidates were tested.
+        small: whether what the causes leave is negligible.
+    """
     named, rules = kept.named, problem.rules
     noise, members = named.fit_target.measured.noise, [len(step.members) for step in named.steps]
     gain = Validation.of_steps(kept.held_out, len(named.steps)).gain
     last = named.test_series[-1].omnibus.p if named.steps else None
-    verdict = decide(rules, named.test_series[0].omnibus.p, last, members, gain, noise.doubtful)
+    verdict = decide(rules, named.test_series[0].omnibus.p, last, members, gain, noise.doubtful, small)
     if not named.fit.converged:  # clearly supported effects are found nevertheless
         return PARTLY if gain is not None and gain.clear else NO_VERDICT
     return verdict if ended or named.steps or verdict != UNEXPLAINED else NO_VERDICT

@@ -131,6 +131,8 @@ def simplified(search: ExtensionSearch, base: Fit, steps: Sequence[Added]) -> tu
         if own < rules.evidence:
             search.report(f"{step.name} is no longer needed")
             return simplified(search, base, without(search, steps, index, base))
+        if simpler:
+            search.report(f"in the place of {step.name}: refitting {len(simpler)} simpler candidates")
         probes = probe_all(search.target, empty, simpler)
         tests = run_score_tests(
             search.target, empty, probes, [c.name for c in simpler], [search.seed, index], search.rules.bootstraps

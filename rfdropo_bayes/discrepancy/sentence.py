@@ -70,7 +70,7 @@ def _stopped(answer: Answer) -> str:
     if cost.stopped == INTERRUPT:
         return f" The audit was stopped after {cost.seconds:.0f} s: these are its results so far.{not_done}"
     minutes, waited = answer.problem.rules.minutes, round(cost.waited / 60.0)
-    busy = f" For {waited} of them the audit waited for processors that other programs held." if waited else ""
+    busy = f" For {waited} of these minutes the audit waited for processors that other programs held." if waited else ""
     return (
         f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
         f"go on with --resume.{not_done}{busy}"
@@ -132,7 +132,12 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if not answer.fitted:
         return f"No verdict: the fit of the base model is not done; so far it leaves {_base_error(answer)}."
     if answer.law is not None:
-        return law_sentence(answer)
+        if answer.law_leads or answer.validation.gain is None:
+            return law_sentence(answer, first=True)
+        named, verb = " and ".join(map(_named, findings)), "explains" if len(findings) == 1 else "explain"
+        gain = answer.validation.gain
+        larger = f"{named} {verb} {gain.share} of the discrepancy in unseen recordings ({_errors(gain)})"
+        return f"{larger}. {law_sentence(answer, first=False)}"
     if answer.verdict == NEGLIGIBLE:
         return _small(answer)
     if not answer.converged:

@@ -48,14 +48,16 @@ def decide(
     class_sizes: Sequence[int],
     gain: Gain | None,
     doubtful: bool = False,
+    small: bool = False,
 ) -> str:
     """Apply the rules.
 
     - no_discrepancy: the base model passes the joint test (p > .01), under a plausible noise;
     - unexplained: it fails, and no candidate is significant, or all together explain at most 20 %, or they worsen the
       prediction of unseen trajectories;
-    - explained: the extended model passes (p > .05), the lower bound of the explained fraction exceeds 80 %, and unseen
-      trajectories clearly support it; equivalent if a named class has several members;
+    - explained: the extended model passes (p > .05) or leaves a negligible residual, the lower bound of the explained
+      fraction exceeds 80 %, and unseen trajectories clearly support it; equivalent if a named class has several
+      members;
     - partly_explained: a significant gain, but a condition of "explained" fails.
 
     Args:
@@ -64,6 +66,7 @@ def decide(
         class_sizes: number of members of each named class.
         gain: gain on unseen trajectories; None if it could not be measured.
         doubtful: see `Stacked.doubtful`.
+        small: whether what the extended model leaves is `negligible`.
     """
     if base_p > rules.base_passes and not doubtful:
         return NO_DISCREPANCY
@@ -73,6 +76,6 @@ def decide(
         return PARTLY
     if gain.worse or gain.explained <= rules.significant:
         return UNEXPLAINED
-    if extended_p > rules.extended_passes and gain.clear and gain.interval[0] > rules.explained:
+    if (small or extended_p > rules.extended_passes) and gain.clear and gain.interval[0] > rules.explained:
         return EQUIVALENT if max(class_sizes) > 1 else EXPLAINED
     return PARTLY

@@ -163,10 +163,10 @@ def unseen_modes(replicates: int, optimisations: int | None = None) -> list[Caut
 
 
 def exclusion_cautions(excluded: Mapping[str, int], evaluations: int) -> list[Caution]:
-    """A caution if more than 5 % of the rollouts were excluded."""
+    """A caution if more than 5 % of the simulations were excluded."""
     total = sum(excluded.values())
     if evaluations == 0 or total / evaluations <= 0.05:
         return []
     reasons = ", ".join(f"{name} {count}" for name, count in sorted(excluded.items()))
-    sentence = f"{total} of {evaluations} rollouts got no weight ({reasons})"
+    sentence = f"{total} of {evaluations} simulations got no weight ({reasons})"
     return [Caution(Code.ROLLOUTS_EXCLUDED, sentence)]

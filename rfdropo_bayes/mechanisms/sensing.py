@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms.default_priors import half_normal, normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
@@ -207,6 +205,7 @@ class ClockOffset:
     parameters = (
         ParameterSpec("clock_offset", "s", -1.0, 1.0, 0.0, normal(0.05), "delay between motion and its time stamp"),
     )
+    shows_future = ("clock_offset",)  # parameters below zero of which no session is possible
 
     def sense_over_time(
         self, values: Values, position: Float[Array, "time marker 3"], time: Float[Array, " time"]
@@ -218,15 +217,6 @@ class ClockOffset:
         """The last observations and their times, as far back as an offset may reach; none before the first."""
         rows = math.ceil(self.parameters[0].high / interval) + 2
         return jnp.broadcast_to(first, (rows, *first.shape)), jnp.zeros(rows)
-
-    def check_steps(self, values: Mapping[str, Float[np.ndarray, " lane"]]) -> None:
-        """Raise InputError if a session would need future positions."""
-        if np.any(values["clock_offset"] < 0.0):
-            raise InputError(
-                f"clock_offset = {np.min(values['clock_offset']):g} s would show the future",
-                where="a session",
-                remedy="leave clock_offset out: it belongs to a recording, and a policy sees one clock",
-            )
 
     def advance(
         self, values: Values, memory: tuple[Array, Array], given: Float[Array, "marker 3"], now: Float[Array, ""]

@@ -6,6 +6,7 @@ Nothing heavy is imported here: a mistyped path is answered before JAX and the e
 from __future__ import annotations
 
 import copy
+import os
 import shutil
 import tomllib
 from collections.abc import Container, Iterator, Mapping, Sequence
@@ -142,7 +143,7 @@ def _placed(entry: Any, folder: Path) -> Any:
         beside = find_files(str(entry), folder, folders=True)[0].is_relative_to(folder)
     except InputError:
         return entry
-    return str(folder / str(entry)) if beside else entry
+    return os.path.normpath(folder / str(entry)) if beside else entry
 
 
 def code_placed(source: str, folder: Path, out: Path | None = None) -> str:

@@ -198,6 +198,42 @@ class Layers:
         return {name: value for part in self.parts for name, value in part.draw(rng).items()}
 
 
+@dataclass(frozen=True)
+class Present:
+    """A posterior or phi without values that would show the future.
+
+    A recording may have time stamps from before its motion; a policy sees nothing early.
+    """
+
+    recorded: Randomisation  # the randomisation as the recordings determine it
+    early: tuple[str, ...]  # parameters whose values below zero become zero, see `ClockOffset.shows_future`
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters that vary or are held."""
+        return self.recorded.names
+
+    @property
+    def kind(self) -> str:
+        """Kind of the randomisation."""
+        return self.recorded.kind
+
+    @property
+    def sha256(self) -> str:
+        """Digest of its inputs."""
+        return _digest([self.recorded.sha256, self.early])
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float]:
+        """Values for one episode."""
+        drawn = self.recorded.draw(rng)
+        return {name: max(value, 0.0) if name in self.early else value for name, value in drawn.items()}
+
+    def share_changed(self, name: str) -> float:
+        """Share of 1,000 draws in which a parameter is below zero."""
+        rng = np.random.default_rng(0)
+        return float(np.mean([self.recorded.draw(rng)[name] < 0.0 for _ in range(1000)]))
+
+
 def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Randomisation:
     """The randomisation, if every value that it can give lies within the hard bounds of a parameter of the simulator.
 
@@ -210,6 +246,9 @@ def fitting(randomisation: Randomisation, specs: Sequence[ParameterSpec]) -> Ran
         return randomisation
     if isinstance(randomisation, Sessions):
         fitting(randomisation.draws, specs)
+        return randomisation
+    if isinstance(randomisation, Present):
+        fitting(randomisation.recorded, specs)
         return randomisation
     where = f"randomisation ({randomisation.kind})"
     check_names(randomisation.names, specs, where=where)

@@ -118,7 +118,7 @@ def _excluded(summary: Mapping[str, Any]) -> str:
         return "No rollout had to be left out."
     reasons = ", ".join(f"{count} {name}" for name, count in sorted(summary["excluded"].items()))
     of = f" of {summary['evaluations']}" if summary["evaluations"] else ""
-    return f"{total}{of} rollouts got no weight ({reasons})."
+    return f"{total}{of} simulations got no weight ({reasons})."
 
 
 def _count(number: int, noun: str) -> str:

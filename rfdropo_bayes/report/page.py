@@ -71,6 +71,7 @@ def render(template: str, **content: Any) -> str:
     )
     environment.filters |= {"number": number, "words": display_name, "duration": duration, "breakable": breakable}
     environment.filters |= {"bootstrap_p": bootstrap_p, "p_value": p_value, "sentences": sentences, "spoken": spoken}
+    environment.filters["sized"] = sized
     environment.globals["interval"] = interval
     assets = {}
     for name, file in (("stylesheet", "page.css"), ("script", "replay.js"), ("sort", "sort.js")):
@@ -113,6 +114,13 @@ def number(value: Any, digits: int = 3) -> str:
         return f"{int(value)}"
     text = f"{value:.{digits}g}"
     return f"{value:.0f}" if "e+0" in text and abs(value) < 1e6 else text
+
+
+def sized(row: Mapping[str, Any]) -> str:
+    """Mean and 90 % interval of a parameter with its unit."""
+    factor, unit = display_unit(row["unit"], max(abs(row["q05"]), abs(row["q95"])))
+    mean, low, high = (number(row[key] / factor) for key in ("mean", "q05", "q95"))
+    return f"{mean} [{low}, {high}] {unit}".strip()
 
 
 def bootstrap_p(p: float, simulated: int) -> str:

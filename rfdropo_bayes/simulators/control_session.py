@@ -274,8 +274,13 @@ class Session:
                 check_value(spec, float(extreme), where="reset")
             given[name] = np.broadcast_to(value, rows.shape)
         for mechanism in self.simulator.mechanisms:
-            if hasattr(mechanism, "check_steps"):
-                mechanism.check_steps({spec.name: given[spec.name] for spec in mechanism.parameters})
+            for name in getattr(mechanism, "shows_future", ()):
+                if np.min(given[name]) < 0.0:
+                    raise InputError(
+                        f"{name} = {np.min(given[name]):g} {self._specs[name].unit} would show the future",
+                        where="a session",
+                        remedy=f"leave {name} out: it belongs to a recording, and a policy sees one clock",
+                    )
         self._table[rows] = np.stack([given[name] for name in self._specs], axis=1)
         self._values = jnp.asarray(self._table)
 

@@ -509,6 +509,11 @@ def extended_tables(
     if laws := law_tables(answer):
         model["laws"] = [*model.get("laws", []), *laws]
         confine_laws(model, answer)
+    if "minutes" in extended.get("inference", {}):  # a step of an optimisation takes rollouts for each parameter
+        adopted = [c for step in answer.adopted if (c := answer.problem.candidate(step.name)) is not None]
+        added = sum(len(c.indices) for c in adopted) + sum(len(law["terms"]) for law in laws)
+        grown = 1.0 + added / max(len(answer.base.free), 1)
+        extended["inference"]["minutes"] = float(f"{extended['inference']['minutes'] * grown:.2g}")
     audit = extended.get("audit", {})
     if "candidates" in audit:
         adopted = {step.name for step in answer.adopted}
@@ -530,7 +535,7 @@ def sized_priors(answer: Answer, candidate: Candidate) -> dict[str, dict[str, An
         for key in ("loc", "low", "high"):  # a size in one group is measured from null
             if key in table and parameter.scope.added_to:
                 table[key] += coordinates.space.specs[parameter.physical].nominal - parameter.spec.nominal
-        if factor[index] > 1.0:
-            table["scale"] = float(f"{table['scale'] * factor[index]:.3g}")
+        if "scale" in table:
+            table["scale"] = float(f"{table['scale'] * max(factor[index], 1.0):.3g}")
         priors[parameter.spec.name] = table
     return priors

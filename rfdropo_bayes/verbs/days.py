@@ -42,10 +42,15 @@ def days_of(recordings: Sequence[Path]) -> dict[str, list[int]]:
     return days if len(days) > 1 else {}
 
 
+def last_third(recordings: Sequence[int]) -> Sequence[int]:
+    """The last third of several recordings, at least one; nothing of a single recording."""
+    return recordings[-max(1, len(recordings) // 3) :] if len(recordings) > 1 else ()
+
+
 def pieces_of(
     counts: Sequence[int], days: Mapping[str, Sequence[int]], *, rests: bool = False, timed: bool = True
 ) -> list[Piece]:
-    """Entries of fit and test: of each day the last recording is the test, or the last third of a single recording.
+    """Entries of fit and test: of each day the last third is the test, of its recordings or of its single recording.
 
     Poses without times have no order, so rows between the fitted ones are the test if there are enough.
 
@@ -57,7 +62,7 @@ def pieces_of(
     """
     groups = list(days.values()) or [range(len(counts))]
     alone = [group[0] for group in groups if len(group) == 1 and counts[group[0]] >= FEWEST_ROWS]
-    tested = {group[-1] for group in groups if len(group) > 1}
+    tested = {number for group in groups for number in last_third(group)}
     fitted = sum(
         (2 * count // 3 if number in alone and timed else count)
         for number, count in enumerate(counts)

@@ -28,7 +28,7 @@ from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.command_lag import errors_by_row
-from rfdropo_bayes.verbs.days import Piece, days_of, group_lines, pieces_of
+from rfdropo_bayes.verbs.days import Piece, days_of, group_lines, last_third, pieces_of
 from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
@@ -337,18 +337,19 @@ def _head(name: str) -> list[str]:
 def _entries(
     folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, pieces: Sequence[Piece] | None
 ) -> tuple[list[str], list[str]]:
-    """The entries of fit and of test; the last recording is the test if there are no pieces."""
+    """The entries of fit and of test; the last third of the recordings is the test if there are no pieces."""
     entries: list[dict[str, Any]] = [{"observations": os.path.relpath(path, folder)} for path in recordings]
     if commands:
         sent = [os.path.relpath(path, folder) for path in commands]
         entries = [{**entry, "commands": file} for entry, file in zip(entries, sent, strict=True)]
     elif guess.format == lerobot.FORMAT and len(entries) == 1:
         episodes = lerobot.episode_numbers(recordings[0])
-        shares = [episodes] if len(episodes) == 1 else [episodes[:-1], episodes[-1:]]
+        kept = last_third(episodes)
+        shares = [episodes[: len(episodes) - len(kept)], kept] if kept else [episodes]
         entries = [{**entries[0], "episodes": share} for share in shares]
         pieces = None
-    last = len(entries) - 1
-    chosen = pieces or [Piece(number, {}, 0 < number == last) for number in range(len(entries))]
+    tested = last_third(range(len(entries)))
+    chosen = pieces or [Piece(number, {}, number in tested) for number in range(len(entries))]
     said: tuple[list[str], list[str]] = ([], [])
     for piece in chosen:
         entry = {**entries[piece.file], **piece.rows}
@@ -410,7 +411,7 @@ def data_tables(
         "[data]",
         f'format = "{guess.format}"',
         f"fit = [{', '.join(fit)}]",
-        f"test = [{', '.join(test)}]  # recordings that no fit ever sees: they score the fit",
+        f"test = [{', '.join(test)}]" + ("  # ASSUMED: kept from every fit, to score fits and audits" if test else ""),
         *masked,
         "",
         "# Guessed from the names and sizes of the columns: look them over.",

@@ -25,6 +25,7 @@ from rfdropo_bayes.policies.randomisation import (
     Draws,
     Layers,
     Point,
+    Present,
     Randomisation,
     Sessions,
     Uniform,
@@ -178,7 +179,9 @@ def randomisation_of(
         parts[-1] = with_width(parts[-1], table.width, simulator.parameters)
     kind = parts[-1].kind
     start = {name: ends for name, ends in table.start.items() if name not in absent}
-    return Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]
+    whole = Layers((*parts, Uniform(start)), kind) if start or len(parts) > 1 else parts[0]
+    early = tuple(name for m in simulator.mechanisms for name in getattr(m, "shows_future", ()) if name in whole.names)
+    return Present(whole, early) if early and kind in ("posterior", "phi") else whole
 
 
 def _randomised(table: TrainingTable, simulator: AnySimulator, folder: Path) -> Randomisation:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rfdropo_bayes.cautions import Caution
+from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_json, write_text
 from rfdropo_bayes.inference.progress import say_step
@@ -21,6 +21,7 @@ from rfdropo_bayes.policies.onnx_export import ExportedPolicy, export_policy, la
 from rfdropo_bayes.policies.parity import difference, observations
 from rfdropo_bayes.policies.policy_figures import curve_figure
 from rfdropo_bayes.policies.policy_page import EPISODES, play_policy, render_policy
+from rfdropo_bayes.policies.randomisation import Present, Randomisation
 from rfdropo_bayes.policies.training import Trained
 from rfdropo_bayes.policies.training import train as learn
 from rfdropo_bayes.policies.training_config import TrainingOptions, TrainingTable
@@ -90,7 +91,7 @@ def train(
     seed = model.settings.seed if seed is None else seed
     table, task, simulator = training_of(model)
     randomisation = randomisation_of(table, model.spec, simulator, fit)
-    cautions = _cautions(table, fit, model.folder, show)
+    cautions = _cautions(table, fit, model.folder, randomisation, show)
     settings = episode_settings(table)
     known = {"randomisation": randomisation.sha256, "simulator": simulator.description["content_sha256"]}
 
@@ -131,16 +132,31 @@ def train(
     return summary
 
 
-def _cautions(table: TrainingTable, fit: Calibration | Path | None, folder: Path, show: bool | None) -> list[Caution]:
-    """Cautions of earlier results on the posterior or phi of the parameters; also printed on stderr."""
+def _cautions(
+    table: TrainingTable, fit: Calibration | Path | None, folder: Path, randomisation: Randomisation, show: bool | None
+) -> list[Caution]:
+    """Cautions of earlier results on the posterior or phi of the parameters, and on values that no policy can meet;
+    also printed on stderr.
+    """
     source = fit
     if source is None and table.source is not None and table.randomisation in ("posterior", "phi"):
         source = source_of(table.source, folder)
     caution = None if source is None else posterior_caution(source, table.width)
-    if caution is None:
-        return []
-    say_step(f"warning: {caution.sentence}", show=show)
-    return [caution]
+    found = [] if caution is None else [caution]
+    if isinstance(randomisation, Present):
+        shares = {name: randomisation.share_changed(name) for name in randomisation.early}
+        found += [
+            Caution(
+                Code.RECORDINGS_ONLY,
+                f"{name} is below 0 s in {100.0 * share:.0f} % of the draws: time stamps of the recordings, which "
+                "would show a policy the future; these draws have 0 s in training",
+            )
+            for name, share in shares.items()
+            if share > 0.0
+        ]
+    for each in found:
+        say_step(f"warning: {each.sentence}", show=show)
+    return found
 
 
 def _tension_facts(best: Mapping[str, float], table: TrainingTable) -> dict[str, str]:

@@ -33,7 +33,7 @@ def test_a_calibration_is_shown_as_it_is(capsys):
     content = {
         "headline": [WORDS],
         "details": {},
-        "parameters": {f"{k}@[red]": ROW for k in range(30)},
+        "parameters": {f"{k}@[red]": ROW for k in range(50)},
         "method": "adapt",
         "recordings": [{"split": "fit", "masked": 1, "positions": 2}],
     }

@@ -119,9 +119,9 @@ def searched(toy, alike=False):
     return question, target, base, law_search(target, *options).find(target, base)
 
 
-def asked(seed, toy=None, alike=False):
+def asked(seed, toy=None, alike=False, truth=TRUTH):
     """The audit of the plain toy on recordings of another one."""
-    plain, trajectories = problem({}, seed), recordings(TRUTH, seed, toy, alike=alike)
+    plain, trajectories = problem({}, seed), recordings(truth, seed, toy, alike=alike)
     gathered = gather_recordings(Toy(), trajectories)
     model = replace(plain.model, recordings=gathered, channels=(Markers.gather(gathered, "repeats"),))
     return replace(
@@ -157,6 +157,44 @@ def test_a_law_at_a_marker_is_described_with_its_size_and_its_worth():
     assert float((left.residual_last**2).mean()) < float((left.residual_base**2).mean())
     assert left.signal.sel(port="marker m3 x").shape == (2, left.sizes["signal_time"])
     assert "Law and port" in render_audit(shown(answer), content, "toy", "")
+
+
+BOTH = {**TRUTH, "play": 8.0}  # a mechanism of the library, whose effect is larger than the push of marker m3
+
+
+@pytest.mark.slow
+def test_a_mechanism_that_takes_more_away_than_the_law_beside_it_is_said_first():
+    answer = audit(asked(5, Pushed(), truth=BOTH))
+
+    def said(changed):
+        content = record(changed, versions={}, data_sha256="", next_experiment=next_experiment(changed))
+        return content["sentence"], content["next_experiment"]["sentence"]
+
+    words, following = said(answer)
+    assert answer.verdict == "described"
+    assert answer.law.beside == ("play",)
+    assert words.startswith("Play (")
+    assert words.index("of the discrepancy in unseen") < words.index("A smaller effect acts") < words.index("marker m3")
+    assert words.index("marker m3") < words.index("of what is left in unseen recordings")
+    assert following.startswith("Check play on the robot")
+    less = replace(answer.validation.gain, rmse_base=answer.law.gain.rmse_base)
+    words, following = said(replace(answer, validation=replace(answer.validation, gain=less)))
+    assert words.startswith("An effect acts")
+    assert "Beside it, play of the library" in words
+    assert "whether marker m3" in following
+
+
+@pytest.mark.slow
+def test_no_law_is_sought_for_less_than_matters():
+    """The same recordings: what the play leaves is below a stated limit."""
+    given = asked(5, Pushed(), truth=BOTH)
+    left = 3e-3  # [m]
+    answer = audit(replace(given, rules=replace(given.rules, matters=left)))
+    assert answer.verdict == "explained"
+    assert [step.name for step in answer.steps] == ["play"]
+    assert answer.described is None
+    assert answer.test_series[-1].omnibus.p <= given.rules.extended_passes
+    assert np.sqrt(3.0) * answer.remainder.amplitude < left
 
 
 @pytest.mark.parametrize(("left", "said"), [(1.0, "at marker tip x, of 0.002 m"), (30.0, "at marker tip x explains")])

@@ -107,5 +107,5 @@ def test_a_prior_that_leaves_the_truth_out_is_said_beside_what_is_found(high, de
 
 def test_an_audit_that_others_kept_from_computing_says_so(answer):
     stopped = replace(answer, cost=replace(answer.cost, stopped=True, waited=620.0))
-    assert "For 10 of them the audit waited for processors that other programs held." in said(stopped)
+    assert "For 10 of these minutes the audit waited for processors that other programs held." in said(stopped)
     assert "waited" not in said(replace(stopped, cost=replace(stopped.cost, waited=20.0)))

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.simulators.mechanisms import SteppedMechanism
 
@@ -87,8 +86,3 @@ def test_a_camera_sees_by_steps_what_it_sees_in_a_rollout(name):
     )
     assert np.abs(whole - POSITION).max() > 1e-5, "it does nothing"
     np.testing.assert_allclose(seen, whole, rtol=0.0, atol=LAST)
-
-
-def test_a_clock_that_shows_the_future_is_refused():
-    with pytest.raises(InputError, match="future"):
-        REGISTRY["clock_offset"]().check_steps({"clock_offset": np.array([0.1, -0.01])})

@@ -106,7 +106,7 @@ def test_the_page_has_every_section_and_figure(folder: Path, record: PosteriorRe
         assert svg.count(b"<path") > (2 if image["class"] == "legend" else 10)
     for text in (
         "Toy trunk",
-        "12 of 20000 rollouts",
+        "12 of 20000 simulations",
         "rayleigh_stiffness sits on a hard bound or at an end of the prior",
         "cubic FIR",
         "Synthetic",

@@ -27,6 +27,7 @@ def answered(candidate: Candidate, x: list[float]) -> Any:
     return SimpleNamespace(
         law=None,
         adopted=[SimpleNamespace(name=candidate.name)],
+        base=SimpleNamespace(free=np.arange(4)),
         extended=SimpleNamespace(x=np.array(x), free=np.arange(2)),
         problem=SimpleNamespace(candidates=[candidate], candidate=lambda name: candidate, coordinates=coordinates),
     )
@@ -35,8 +36,13 @@ def answered(candidate: Candidate, x: list[float]) -> Any:
 def test_a_mechanism_of_the_users_own_is_found_again_and_tried_no_more(tmp_path: Path) -> None:
     answer = answered(Candidate("own", (0, 1), REGISTRY["drive_creep"](), "own.py:Own"), [0.5, 0.0])
     (tmp_path / "own.py").touch()
-    tables = {"robot": "smooth_arm", "audit": {"candidates": ["own.py:Own", "own.py:Other"]}}
+    tables = {
+        "robot": "smooth_arm",
+        "audit": {"candidates": ["own.py:Own", "own.py:Other"]},
+        "inference": {"minutes": 3},
+    }
     extended = extended_tables(tables, answer, tmp_path)
+    assert extended["inference"]["minutes"] == 4.5  # six parameters in place of four
     assert extended["model"]["mechanisms"] == [f"{tmp_path / 'own.py'}:Own"]
     assert extended["audit"]["candidates"] == [f"{tmp_path / 'own.py'}:Other"]
     assert tables["audit"]["candidates"] == ["own.py:Own", "own.py:Other"]

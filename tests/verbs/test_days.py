@@ -41,6 +41,7 @@ def test_the_last_third_is_kept_for_a_test_unless_there_are_few_rows():
     assert pieces_of([90], {}) == [Piece(0, {"rows": [0, 59]}, False), Piece(0, {"rows": [60, 89]}, True)]
     assert pieces_of([40], {}) == [Piece(0, {}, False)]
     assert pieces_of([90, 40], {}) == [Piece(0, {}, False), Piece(1, {}, True)]
+    assert [piece.tested for piece in pieces_of([90] * 7, {})] == [False] * 5 + [True] * 2
 
 
 def test_every_day_is_fitted_and_tested():

@@ -74,7 +74,8 @@ def test_what_is_assumed_of_a_motive_export_is_marked(tmp_path, monkeypatch, cap
     assert table["missing"] == "mask"
     assert table["columns"]["axes"] == ["x", "-z", "y"]
     assert table["columns"]["position_unit"] == "mm"
-    assert [line.split()[0] for line in text.splitlines() if "ASSUMED" in line] == ["command_time_unit", "#", "axes"]
+    assumed = [line.split()[0] for line in text.splitlines() if "ASSUMED" in line]
+    assert assumed == ["test", "command_time_unit", "#", "axes"]
     status, told = rfdropo(monkeypatch, capsys, "init", "other", "--recording", "take_1.csv", "--defaults")
     assert status == 2
     assert "found no commands" in told

@@ -24,7 +24,7 @@ from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.policy_layout import EVALUATED_EPISODES, PEAK_TENSION, STOPPED_EPISODES, TENSION_LIMIT
 from rfdropo_bayes.verbs.make_vec import randomisation_of, training_of, with_training
-from rfdropo_bayes.verbs.train import _summary, _tension_facts, training_sentence
+from rfdropo_bayes.verbs.train import _cautions, _summary, _tension_facts, training_sentence
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 REACH = REPOSITORY / "experiments" / "reach_policy.toml"
@@ -304,6 +304,26 @@ def test_what_a_fit_held_is_held_in_the_episodes_too(tmp_path) -> None:
             drawn = found.draw(np.random.default_rng(0))
             assert drawn.pop("young_modulus") == pytest.approx(2e6, rel=0.05)
             assert drawn == {"trunk_mass": 0.31, "poisson_ratio": 0.4}
+
+
+def test_time_stamps_of_recordings_do_not_show_a_policy_the_future(capsys) -> None:
+    """An audit may find that the cameras' stamps come early: a session cannot start so, and training takes zero."""
+    infos = (ParameterInfo("young_modulus", "Pa"), ParameterInfo("clock_offset", "s"))
+    draws = {"young_modulus": np.full((1, 4), 2e6), "clock_offset": np.array([[-0.03, -0.01, -0.02, 0.02]])}
+    fit = Calibration(PosteriorRecord(infos, draws), {}, "")
+    model = rb.Model("trunk_sofa", mechanisms=["clock_offset"])
+    table, _, simulator = training_of(with_training(model, {"task": "TrunkReach-v0"}))
+    found = fitting(randomisation_of(table, model.spec, simulator, fit), simulator.parameters)
+    assert found.share_changed("clock_offset") == pytest.approx(0.75, abs=0.05)
+    rng = np.random.default_rng(0)
+    assert {found.draw(rng)["clock_offset"] for _ in range(30)} == {0.0, 0.02}
+    assert np.isfinite(rb.make_vec("TrunkReach-v0", model, fit=fit, n=2).reset()).all()
+    (caution,) = _cautions(table, fit, Path(), found, True)
+    assert caution.code == "recordings_only"
+    assert "clock_offset is below 0 s in 7" in capsys.readouterr().err
+    stated = rb.Model("trunk_sofa", mechanisms=["clock_offset"], fixed={"clock_offset": -0.03})
+    with pytest.raises(InputError, match=r"clock_offset = -0\.03 s would show the future"):
+        rb.make_vec("TrunkReach-v0", stated, n=2).reset()
 
 
 @pytest.mark.parametrize("given", ["posterior", "uniform"])

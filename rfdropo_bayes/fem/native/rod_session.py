@@ -122,15 +122,7 @@ class RodSession:
         still = np.zeros((len(rows), 1, self.engine.tables.drives))
         run = self.engine.run_of(material, still, start, before, 0, 1, cube, loads)
         self._admit(run, material.effects.rubs)
-        settles = run.schedule.static_iterations > 0
-        keys = [b"".join(_row(getattr(run.batch, n), row).tobytes() for n in GIVEN) for row in range(len(rows))]
-        known = self._equilibria if settles else OrderedDict()
-        first = {key: row for row, key in reversed(list(enumerate(keys))) if key not in known}
-        fresh = self._settled(_taken(run, list(first.values())))
-        cached = {key: known[key] for key in keys if key in known}
-        cached |= {key: jax.tree.map(itemgetter(row), fresh) for row, key in enumerate(first)}
-        self._remember(known, cached)
-        lanes = jax.tree.map(lambda *parts: np.stack(parts), *(cached[key] for key in keys))
+        lanes = self._recalled(run) if run.schedule.static_iterations > 0 else self._settled(run)
         pose = None
         if run.cubes is not None:
             lanes, pose = self._with_cubes(lanes, run.cubes), np.asarray(run.cubes.state[:, None, :7], float)
@@ -232,14 +224,21 @@ class RodSession:
                 lanes.state[:, place.first : place.last] = fields[place.name]
         return lanes
 
-    def _remember(self, known: OrderedDict[bytes, _SessionLane], results: dict[bytes, _SessionLane]) -> None:
-        """Cache the latest results within the reserved memory."""
-        for key, lane in results.items():
+    def _recalled(self, run: Run) -> _SessionLane:
+        """The equilibria of a batch; those found before are not computed again, within the reserved memory."""
+        known, rows = self._equilibria, range(run.batch.count)
+        keys = [b"".join(_row(getattr(run.batch, n), row).tobytes() for n in GIVEN) for row in rows]
+        first = {key: row for row, key in reversed(list(enumerate(keys))) if key not in known}
+        fresh = self._settled(_taken(run, list(first.values())))
+        found = {key: known[key] for key in keys if key in known}
+        found |= {key: jax.tree.map(itemgetter(row), fresh) for row, key in enumerate(first)}
+        for key, lane in found.items():
             known[key] = lane
             known.move_to_end(key)
         most = REMEMBERED // (self.memory.shape[1] * self.engine.dtype.itemsize)
         while len(known) > most:
             known.popitem(last=False)
+        return jax.tree.map(lambda *parts: np.stack(parts), *(found[key] for key in keys))
 
     def _records(self, block: int) -> Records:
         """Scratch of the calling thread around the memory of a block."""

@@ -491,7 +491,8 @@ def _collect(search: Optimisations, target: Optimisable, matter: Bool[np.ndarray
 def _unfinished(converged: bool) -> list[Caution]:
     """A caution if the best optimisation has not converged."""
     sentence = (
-        "the best optimisation had not converged when its steps or its budget ran out; raise max_steps or rollouts"
+        "the best optimisation had not converged when its steps or its budget ran out; raise minutes, or rollouts and "
+        "max_steps, in [inference]"
     )
     return [] if converged else [Caution(Code.OPTIMISATION_UNFINISHED, sentence, grave=True)]
 
