@@ -107,11 +107,6 @@ def _twisted_mount(size: float, position: Any, time: Any, command: Any) -> Any:
     return position + turn[:, None, None] * jnp.cross(jnp.array([0.0, 0.0, 1.0]), position)
 
 
-def _zoom(size: float, position: Any, time: Any, command: Any) -> Any:
-    """Lengths grow by half a per cent in the whole recording."""
-    return position * (1.0 + 0.01 * size * time / time[-1])[:, None, None]
-
-
 def _magnet(size: float, scene: Scene) -> dict[str, Any]:
     """A pull of the tip towards a point, which falls with the distance."""
     way = jnp.array([0.06, 0.04, 0.19]) - scene.tip
@@ -193,7 +188,6 @@ EFFECTS: dict[str, Effect] = {
     "sliding_marker": Effect(("marker {markers[2]} along the body", "marker {markers[2]} z"), ("time",), sees=_slide),
     "slow_clock": Effect(("observation delay",), ("time",), sees=_clock),
     "twisted_mount": Effect(("camera turn z",), ("command",), sees=_twisted_mount),
-    "zooming_camera": Effect(("camera scale",), ("time",), sees=_zoom),
 }
 """Of drives, body, surroundings, sensing and clocks."""
 
