@@ -84,6 +84,14 @@ Recordings = Annotated[
         help="CSV, Motive export, ROS bag, MCAP file or LeRobotDataset to fit, or a quoted pattern; may be repeated",
     ),
 ]
+Tests = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--test",
+        metavar="FILE",
+        help="recording that no fit sees, to score fits and audits, or a quoted pattern; by default the last third",
+    ),
+]
 Commands = Annotated[
     list[str] | None,
     typer.Option(
@@ -159,6 +167,7 @@ Defaults = Annotated[bool, typer.Option("--defaults", help="ask nothing; take de
 def init(
     folder: Target,
     recording: Recordings = None,
+    test: Tests = None,
     commands: Commands = None,
     shape: Shape = None,
     length: Length = None,
@@ -201,7 +210,11 @@ def init(
     from rfdropo_bayes.verbs.split_files import split_files
 
     ask = Questions(sys.stdin.isatty() and not defaults)
-    files = matching_recordings(recording or [])
+    tested = matching_recordings(test or [])
+    files = [file for file in matching_recordings([*(recording or []), *(test or [])]) if file not in tested]
+    if tested and not files:
+        raise InputError("no recording is left to fit", where="--test", remedy="give others with --recording")
+    files += tested
     sent = matching_commands(commands or [], files)
     guess = None
     if files:
@@ -210,9 +223,12 @@ def init(
         guess = with_given(guess, command_unit=command_unit, position_unit=position_unit, sample_time=sample_time)
         guess = with_turns(with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None))
     if folder.suffix in MODELS:
-        _init_model(folder, files, sent, guess)
+        _init_model(folder, files, sent, guess, len(tested))
         return
-    split = {} if guess is None or guess.format != FORMAT or sent else split_files(folder, files, guess)
+    split, kept = dict[Path, str](), len(tested)
+    if guess is not None and guess.format == FORMAT and not sent:
+        unseen = split_files(folder, tested, guess)
+        split, kept = split_files(folder, files[: len(files) - len(tested)], guess) | unseen, len(unseen)
     files = list(split) or files
     unit = guess.command_unit if guess else ask.answer("command_unit", command_unit, "Commands in", "mm")
     if unit not in UNITS:
@@ -237,7 +253,7 @@ def init(
     outline = _outline(_name(folder.resolve().name, "robot"), disks, unit, answers, ask.assumed)
     if guess is not None:
         guess, outline = with_drives(of_robot(guess, outline), outline)
-    robot, experiment = write_first_files(folder, outline, files, sent, guess)
+    robot, experiment = write_first_files(folder, outline, files, sent, guess, kept)
     typer.echo(f"wrote {robot}\nwrote {experiment}")
     if ask.assumed:
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
@@ -258,11 +274,11 @@ def _listed(names: str | None) -> list[str] | None:
     return None if names is None else [name.strip() for name in names.split(",")]
 
 
-def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any) -> None:
+def _init_model(model: Path, files: list[Path], sent: list[Path], guess: Any, kept: int) -> None:
     """Write an experiment for a model of another simulator."""
     from rfdropo_bayes.verbs.init_model import write_model_experiment
 
-    path, assumed = write_model_experiment(model, Path(model.stem), files, sent, guess)
+    path, assumed = write_model_experiment(model, Path(model.stem), files, sent, guess, kept)
     typer.echo(f"wrote {path}")
     for line in assumed:
         typer.echo(f"assumed: {line}")

@@ -77,7 +77,7 @@ def show_audit(content: Mapping[str, Any], folder: Path) -> None:
     rows = [
         (name, row, finding["mechanism"].replace("_", " "))
         for finding in content["findings"]
-        for name, row in finding["parameters"].items()
+        for name, row in (_differences(finding) or finding["parameters"]).items()
     ]
     if rows:
         console.print(_parameters(rows[:MOST_ROWS]))
@@ -86,6 +86,11 @@ def show_audit(content: Mapping[str, Any], folder: Path) -> None:
         again = shlex.join(["rfdropo", "calibrate", str(folder / "extended.toml"), "--out", "OUT"])
         console.print(f"then: {again}", soft_wrap=True)
     console.print(f"report: {folder / 'report.html'}; extended model: {folder / 'extended.toml'}", soft_wrap=True)
+
+
+def _differences(finding: Mapping[str, Any]) -> dict[str, Any]:
+    """Members of a family less their median, if the data determine only these."""
+    return {name: row for name, row in finding["relative"].items() if row["power"] == 0}
 
 
 def show_simulation(content: Mapping[str, Any]) -> None:

@@ -48,9 +48,10 @@ def last_third(recordings: Sequence[int]) -> Sequence[int]:
 
 
 def pieces_of(
-    counts: Sequence[int], days: Mapping[str, Sequence[int]], *, rests: bool = False, timed: bool = True
+    counts: Sequence[int], days: Mapping[str, Sequence[int]], *, rests: bool = False, timed: bool = True, kept: int = 0
 ) -> list[Piece]:
-    """Entries of fit and test: of each day the last third is the test, of its recordings or of its single recording.
+    """Entries of fit and test: of each day the last third is the test, of its recordings or of its single recording;
+    or the last ``kept`` recordings.
 
     Poses without times have no order, so rows between the fitted ones are the test if there are enough.
 
@@ -61,8 +62,9 @@ def pieces_of(
         timed: whether rows have times.
     """
     groups = list(days.values()) or [range(len(counts))]
-    alone = [group[0] for group in groups if len(group) == 1 and counts[group[0]] >= FEWEST_ROWS]
+    alone = [group[0] for group in groups if not kept and len(group) == 1 and counts[group[0]] >= FEWEST_ROWS]
     tested = {number for group in groups for number in last_third(group)}
+    tested = set(range(len(counts) - kept, len(counts))) if kept else tested
     fitted = sum(
         (2 * count // 3 if number in alone and timed else count)
         for number, count in enumerate(counts)

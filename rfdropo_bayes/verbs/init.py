@@ -174,18 +174,24 @@ def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutlin
 
 
 def write_first_files(
-    folder: Path, outline: RobotOutline, recordings: list[Path], commands: list[Path], guess: Guess | None
+    folder: Path,
+    outline: RobotOutline,
+    recordings: list[Path],
+    commands: list[Path],
+    guess: Guess | None,
+    kept: int = 0,
 ) -> tuple[Path, Path]:
     """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
 
     Args:
         folder: folder to create and write to.
         outline: the robot.
-        recordings: files to fit; the last of several is for testing, as is the last episode of a dataset, and the last
-            third of the rows of a single recording.
+        recordings: files to fit; without ``kept`` the last third is for testing: of several recordings, of the
+            episodes of a dataset, and of the rows of a single recording.
         commands: files of commands, one for each recording, if separate.
         guess: guess of the recordings' columns, see `of_robot`; None without recordings, if random commands are
-        simulated.
+            simulated.
+        kept: number of recordings for testing, the last of all.
 
     Raises:
         InputError: the files exist already, or the folder cannot be written to.
@@ -223,6 +229,7 @@ def write_first_files(
         guess=guess,
         gravity=outline.gravity,
         cables=outline.cable_names(),
+        kept=kept,
     )
     plain = write(tables())
     runs = _recordings(plain, folder)
@@ -240,7 +247,7 @@ def write_first_files(
     frame = [f"{line}  # ASSUMED: found from the first row" for line in _frame(plain, made, guess)]
     slow = slow_motion(made, first) if timed else NO_MOTION
     pieces = (
-        pieces_of([len(run.time) for run in runs], days, rests=slow is not None, timed=timed)
+        pieces_of([len(run.time) for run in runs], days, rests=slow is not None, timed=timed, kept=kept)
         if len(runs) == len(recordings)
         else None
     )
@@ -335,20 +342,20 @@ def _head(name: str) -> list[str]:
 
 
 def _entries(
-    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, pieces: Sequence[Piece] | None
+    folder: Path, recordings: list[Path], commands: list[Path], guess: Guess, pieces: Sequence[Piece] | None, kept: int
 ) -> tuple[list[str], list[str]]:
-    """The entries of fit and of test; the last third of the recordings is the test if there are no pieces."""
+    """The entries of fit and of test; without pieces the last ``kept`` recordings, or the last third, are the test."""
     entries: list[dict[str, Any]] = [{"observations": os.path.relpath(path, folder)} for path in recordings]
     if commands:
         sent = [os.path.relpath(path, folder) for path in commands]
         entries = [{**entry, "commands": file} for entry, file in zip(entries, sent, strict=True)]
     elif guess.format == lerobot.FORMAT and len(entries) == 1:
         episodes = lerobot.episode_numbers(recordings[0])
-        kept = last_third(episodes)
-        shares = [episodes[: len(episodes) - len(kept)], kept] if kept else [episodes]
+        unseen = last_third(episodes)
+        shares = [episodes[: len(episodes) - len(unseen)], unseen] if unseen else [episodes]
         entries = [{**entries[0], "episodes": share} for share in shares]
         pieces = None
-    tested = last_third(range(len(entries)))
+    tested = range(len(entries))[-kept:] if kept else last_third(range(len(entries)))
     chosen = pieces or [Piece(number, {}, number in tested) for number in range(len(entries))]
     said: tuple[list[str], list[str]] = ([], [])
     for piece in chosen:
@@ -382,15 +389,17 @@ def data_tables(
     pieces: Sequence[Piece] | None = None,
     poses: str | None = None,
     order: str | None = None,
+    kept: int = 0,
 ) -> list[str]:
-    """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it.
+    """The tables [data] and [data.columns] of a first experiment, as lines; ``gravity`` as `RobotOutline` has it, and
+    ``kept`` as `write_first_files`.
 
     ``frame`` are the lines of axes and origin with their evidence, if a recording determines them; ``cables`` the
     robot's, one for each command, if tensions of them were measured; ``pieces`` see `pieces_of`; ``poses`` the reason
     to take each command for that of the pose in its row; ``order`` the reason for another order of the commands than
     the file's.
     """
-    fit, test = _entries(folder, recordings, commands, guess, pieces)
+    fit, test = _entries(folder, recordings, commands, guess, pieces, kept)
     lost = lost_positions(recordings, guess)
     counted = f" ({', '.join(f'{name}: {count} empty cells' for name, count in lost.items())})" if lost else ""
     masked = [f'missing = "mask"  # positions that motion capture lost are left out{counted}']
@@ -411,7 +420,7 @@ def data_tables(
         "[data]",
         f'format = "{guess.format}"',
         f"fit = [{', '.join(fit)}]",
-        f"test = [{', '.join(test)}]" + ("  # ASSUMED: kept from every fit, to score fits and audits" if test else ""),
+        f"test = [{', '.join(test)}]" + (f"  # {'' if kept else 'ASSUMED: '}no fit sees them" if test else ""),
         *masked,
         "",
         "# Guessed from the names and sizes of the columns: look them over.",

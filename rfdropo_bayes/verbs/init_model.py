@@ -25,14 +25,14 @@ OF_CABLE = {"m": tuple(METRES), "rad": ANGLES}  # units of commands in recording
 
 
 def write_model_experiment(
-    model: Path, folder: Path, recordings: list[Path], commands: list[Path], guess: Guess | None
+    model: Path, folder: Path, recordings: list[Path], commands: list[Path], guess: Guess | None, kept: int = 0
 ) -> tuple[Path, list[str]]:
     """Write ``experiment.toml`` for a model's file, and read it back.
 
     Args:
         model: file of the model, which is not moved.
         folder: folder to create and write to.
-        recordings: files to fit; the last of several is for testing.
+        recordings: files to fit; the last third of several, or the last ``kept``, are for testing.
         commands: files of commands, one for each recording, if separate.
         guess: guess of the recordings' columns; None without recordings.
 
@@ -62,7 +62,11 @@ def write_model_experiment(
         "seed = 0",
         "",
         *_adapter(tables, assumed),
-        *(_random(box) if guess is None else data_tables(folder, list(tables["markers"]), recordings, commands, guess)),
+        *(
+            _random(box)
+            if guess is None
+            else data_tables(folder, list(tables["markers"]), recordings, commands, guess, kept=kept)
+        ),
         *_inferred(tables),
     ]
     experiment.write_text("\n".join(text), encoding="utf-8")

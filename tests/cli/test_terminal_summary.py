@@ -18,7 +18,7 @@ ROW = {"mean": 1.0, "sd": 0.1, "q05": 0.9, "q95": 1.1, "unit": "[m]"}
 
 
 def test_an_audit_is_shown_as_it_is(capsys):
-    finding = {"mechanism": "play", "parameters": {"play@[red]": ROW}}
+    finding = {"mechanism": "play", "parameters": {"play@[red]": ROW}, "relative": {}}
     found = {"verdict": "explained", "sentence": WORDS, "findings": [finding], "next_experiment": {"sentence": WORDS}}
     cautions = [{"code": "recording_doubtful", "sentence": WORDS, "grave": False}]
     show_audit({**found, "adopted": ["play"], "cautions": cautions}, FOLDER)

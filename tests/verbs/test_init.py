@@ -132,6 +132,26 @@ def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, mon
     assert int((~fitted.position_mask).sum()) == 6
 
 
+def test_the_last_third_is_the_test_unless_recordings_are_named_for_it(tmp_path, monkeypatch, capsys):
+    for number in range(1, 8):
+        table("time", "{marker}_{axis}", "motor{0}").to_csv(tmp_path / f"run_{number}.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "arm", "--recording", "run_*.csv")
+    assert status == 0
+    assert 'look over: test = ["../run_6.csv", "../run_7.csv"]  # ASSUMED: no fit sees them' in told
+    status, told = init(monkeypatch, capsys, "other", "--recording", "run_*.csv", "--test", "run_[25].csv")
+    assert status == 0
+    assert "test =" not in told
+    data = load_experiment(tmp_path / "other" / "experiment.toml")[0].data
+    named = [
+        [recording.name for recording in load_recordings(data, tmp_path / "other", role)] for role in ("fit", "test")
+    ]
+    assert named == [[f"run_{k}" for k in (1, 3, 4, 6, 7)], ["run_2", "run_5"]]
+    status, told = init(monkeypatch, capsys, "third", "--recording", "run_1.csv", "--test", "run_1.csv")
+    assert status == 2
+    assert "no recording is left to fit" in told
+
+
 def test_a_file_without_positions_is_refused(tmp_path):
     table("t", "{marker}_{axis}", "u{0}").filter(regex="t$|u").to_csv(tmp_path / "run.csv", index=False)
     with pytest.raises(InputError, match="found no positions"):
