@@ -213,7 +213,7 @@ class Answer:
     @property
     def law_leads(self) -> bool:
         """Whether a law takes more of the squared error of unseen recordings away than the mechanisms beside it."""
-        named, law = self.validation.gain, self.law and self.law.gain
+        named, law = self.validation.gain, None if self.law is None else self.law.gain
         if law is None or named is None or not self.steps:
             return law is not None
         taken, by_law = (gain.rmse_base**2 - gain.rmse_extended**2 for gain in (named, law))

@@ -132,12 +132,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     if not answer.fitted:
         return f"No verdict: the fit of the base model is not done; so far it leaves {_base_error(answer)}."
     if answer.law is not None:
-        if answer.law_leads or answer.validation.gain is None:
-            return law_sentence(answer, first=True)
-        named, verb = " and ".join(map(_named, findings)), "explains" if len(findings) == 1 else "explain"
-        gain = answer.validation.gain
-        larger = f"{named} {verb} {gain.share} of the discrepancy in unseen recordings ({_errors(gain)})"
-        return f"{larger}. {law_sentence(answer, first=False)}"
+        return _described(answer, findings)
     if answer.verdict == NEGLIGIBLE:
         return _small(answer)
     if not answer.converged:
@@ -187,6 +182,16 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     else:
         head = f"The best of the library, {named}, explains {share}, but {_pattern(answer)}"
     return f"{head}{_excluded(answer)}; {_remains(answer)}{_assumption(answer)}.{_adoption(answer)}"
+
+
+def _described(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
+    """The law, after the mechanisms beside it if these explain more."""
+    gain = answer.validation.gain
+    if gain is None or answer.law_leads:
+        return law_sentence(answer, first=True)
+    names, verb = " and ".join(map(_named, findings)), "explains" if len(findings) == 1 else "explain"
+    larger = f"{names} {verb} {gain.share} of the discrepancy in unseen recordings ({_errors(gain)})"
+    return f"{larger}. {law_sentence(answer, first=False)}"
 
 
 def _base_error(answer: Answer) -> str:

@@ -511,8 +511,8 @@ def extended_tables(
         model["laws"] = [*model.get("laws", []), *laws]
         confine_laws(model, answer)
     if "minutes" in extended.get("inference", {}):  # a step of an optimisation takes rollouts for each parameter
-        adopted = [c for step in answer.adopted if (c := answer.problem.candidate(step.name)) is not None]
-        added = sum(len(c.indices) for c in adopted) + sum(len(law["terms"]) for law in laws)
+        joined = [c for step in answer.adopted if (c := answer.problem.candidate(step.name)) is not None]
+        added = sum(len(c.indices) for c in joined) + sum(len(law["terms"]) for law in laws)
         grown = 1.0 + added / max(len(answer.base.free), 1)
         extended["inference"]["minutes"] = float(f"{extended['inference']['minutes'] * grown:.2g}")
     audit = extended.get("audit", {})
