@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rfdropo_bayes.cli.main import app
+from rfdropo_bayes.cli.options import same_command
 from rfdropo_bayes.cli.terminal_summary import show_audit, show_calibration
 from rfdropo_bayes.inference.progress import Progress
 
@@ -82,3 +83,21 @@ def test_a_prediction_says_what_it_does_before_it_has_done_it(tmp_path, monkeypa
     spoken = CliRunner().invoke(app, asked)
     assert spoken.stderr == f"predicting next.csv with draws of {tmp_path}\n"
     assert spoken.stdout == ""
+
+
+def test_the_command_that_goes_on_sets_a_key_once(monkeypatch):
+    words = ["rfdropo", "audit", "arm.toml", "--set", "audit.minutes=14", "--set", "seed=2", "--overwrite"]
+    monkeypatch.setattr("sys.argv", words)
+    again = same_command("rfdropo", "--resume", "--set", "audit.minutes=28")
+    assert again == "rfdropo audit arm.toml --set seed=2 --resume --set audit.minutes=28"
+    assert same_command("rfdropo", "--resume") == "rfdropo audit arm.toml --set audit.minutes=14 --set seed=2 --resume"
+
+
+def test_a_family_is_shown_by_what_the_data_determine(capsys):
+    apart = {"gain_1_less_median": {**ROW, "power": 0, "parameter": "gain_1"}}
+    finding = {"mechanism": "cable_gain", "parameters": {"gain_1": ROW}, "relative": apart}
+    found = {"verdict": "explained", "sentence": "", "findings": [finding], "next_experiment": {"sentence": ""}}
+    show_audit({**found, "adopted": [], "cautions": []}, FOLDER)
+    shown = capsys.readouterr().out
+    assert "gain_1_less_median" in shown
+    assert "gain_1 " not in shown
