@@ -220,17 +220,8 @@ def write_first_files(
     if guess is None:
         write(_random_commands(outline))
         return robot, experiment
-    tables = partial(
-        data_tables,
-        folder,
-        outline.markers,
-        recordings,
-        commands,
-        guess=guess,
-        gravity=outline.gravity,
-        cables=outline.cable_names(),
-        kept=kept,
-    )
+    known: dict[str, Any] = {"gravity": outline.gravity, "cables": outline.cable_names(), "kept": kept}
+    tables = partial(data_tables, folder, outline.markers, recordings, commands, guess, **known)
     plain = write(tables())
     runs = _recordings(plain, folder)
     if not runs:

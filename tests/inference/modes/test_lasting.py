@@ -119,4 +119,4 @@ def test_a_caution_says_what_a_row_counts():
     (caution,) = lasting_cautions(lasting)
     assert caution.code is Code.RESIDUALS_LAST
     assert "9 rows" in caution.sentence
-    assert "counts 0.1" in caution.sentence
+    assert "worth 0.1 of an independent row" in caution.sentence
