@@ -221,7 +221,7 @@ def write_first_files(
         write(_random_commands(outline))
         return robot, experiment
     known: dict[str, Any] = {"gravity": outline.gravity, "cables": outline.cable_names(), "kept": kept}
-    tables = partial(data_tables, folder, outline.markers, recordings, commands, guess, **known)
+    tables = partial(data_tables, folder, outline.markers, recordings, commands, guess=guess, **known)
     plain = write(tables())
     runs = _recordings(plain, folder)
     if not runs:
