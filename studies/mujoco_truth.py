@@ -97,7 +97,7 @@ def _one_gain(model: Any, size: float) -> None:
 
 def _lag(levels: np.ndarray, size: float) -> np.ndarray:
     """A drive of first order, ``size`` [s] its time constant."""
-    kept, found = np.exp(-CONTROL / size), [levels[0]]
+    kept, found = np.exp(-CONTROL / size) if size > 0.0 else 0.0, [levels[0]]
     for row in levels[1:]:
         found.append(kept * found[-1] + (1.0 - kept) * row)
     return np.array(found)
