@@ -123,7 +123,7 @@ def test_an_effect_of_no_size_changes_nothing_and_one_of_its_usual_size_does(arm
     effect = ENGINE_EFFECTS[name]
     own = replace(arm, effect=effect, _seen={})
     still = arm.positions(blank, 0.0)
-    np.testing.assert_allclose(own.positions(blank, 1e-9), still, atol=2e-6)
+    np.testing.assert_allclose(own.positions(blank, 0.0), still, atol=2e-6)
     moved = np.abs(own.positions(blank, effect.usual) - still)
     assert moved.max() > 1e-4
     if name == "site moved":
