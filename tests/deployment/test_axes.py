@@ -129,6 +129,7 @@ def test_every_axis_gets_its_own_limits_and_mapping(rigs) -> None:
 def test_an_emergency_names_the_drives_of_its_node(rigs) -> None:
     """It does not say which axis it means."""
     drives = rigs(TWO_BY_TWO).drives(GUARDS)
+    drives.configure(0.01, lambda text: None)
     watch = Watch(drives, SafetyTable())
     for drive in drives.all:
         drive.reading = Reading(0x40, 0, 0, 0.0)

@@ -217,7 +217,8 @@ def test_emergencies_and_heartbeats_are_taken_in(rig) -> None:
 
 def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig) -> None:
     """Drives that report an error as gone, again and again, fill what is kept of them."""
-    drives = rig.drives()
+    drives = rig.drives(Guards(master_timeout_s=5.0))
+    drives.configure(0.01, lambda text: None)  # a node that still boots has left OPERATIONAL
     watch = Watch(drives, SafetyTable())
     left = objects.EMCY + drives.all[1].motor.node
     heard = drives.network.subscribers[left][-1]
@@ -234,5 +235,6 @@ def test_an_emergency_after_any_number_of_harmless_messages_ends_the_session(rig
 
 def test_a_drive_whose_first_status_is_late_is_waited_for(rig) -> None:
     """A loaded machine has no answer yet in the first cycle; nobody may read a tension of it."""
-    drives = rig.drives()
+    drives = rig.drives(Guards(master_timeout_s=5.0))
+    drives.configure(0.01, lambda text: None)
     Watch(drives, SafetyTable()).check(Tick(1, 0.0, 0.0, 0), None)
