@@ -12,5 +12,5 @@ from rfdropo_bayes.data.repeats import command_openings, group_repeats, noise_fl
 from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.spec import DataSpec, RecordingEntry, find_data_file, load_recordings
 from rfdropo_bayes.data.trajectory import Trajectory
-from rfdropo_bayes.data.unseen import first_row_only, load_commanded, load_unseen, one_at_a_time, start_is_known
+from rfdropo_bayes.data.unseen import first_row_only, load_unseen, one_at_a_time, start_is_known
 from rfdropo_bayes.files import DATA_VARIABLE

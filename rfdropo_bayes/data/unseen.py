@@ -32,18 +32,6 @@ def load_unseen(
     begun: str | None = None,
     episode: int | None = None,
 ) -> Trajectory:
-    """The commands of a file in the format of an experiment, and its start pose; see `load_commanded`."""
-    return first_row_only(load_commanded(spec, base, commands, start, begun, episode))
-
-
-def load_commanded(
-    spec: DataSpec,
-    base: Path,
-    commands: str,
-    start: str | None = None,
-    begun: str | None = None,
-    episode: int | None = None,
-) -> Trajectory:
     """The commands of a file in the format of an experiment, with the measurements that the file has.
 
     Formats that keep commands and observations in one file take the start pose from its first row. "asl-csv", and

@@ -28,7 +28,8 @@ SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
 FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
-FAMILY, SHARPER = 3, 0.5  # fewest members with a median; deviation of differences over that of members
+FAMILY = 3  # fewest members that have a median beside them
+SHARPER = 0.5  # deviation of differences over that of members: .88 and more if independent, .06 beside a common gain
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
 REFINE = "raise [simulator] refine and, if the robot moves, shorten time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
@@ -42,8 +43,8 @@ def record(
     ``doubts`` are cautions on its recordings.
     """
     first = answer.test_series[0]
-    refits = answer.steps[0].refits if answer.steps else answer.refits
-    refits = {step.name: step.log_bayes_factor for step in answer.steps} | refits
+    refits = {step.name: step.log_bayes_factor for step in answer.steps}
+    refits |= answer.steps[0].refits if answer.steps else answer.refits
     findings = [_finding(answer, step, stage) for step, stage in zip(answer.steps, _shares(answer), strict=True)]
     gain, noise = answer.validation.gain, answer.target.noise.first
     measured = answer.target.measurements
@@ -230,8 +231,8 @@ def _finding(answer: Answer, step: Added, share: float | None) -> dict[str, Any]
     relative: dict[str, Any] = {}
     if candidate is not None:
         parameters = _drawn_parameters(answer, candidate.indices)
-        relative = relative_sizes(answer.problem.coordinates, answer.sizes, candidate.indices)
-        relative = relative or differences(answer.problem.coordinates, answer.draws, candidate.indices)
+        own, indices = answer.problem.coordinates, candidate.indices
+        relative = relative_sizes(own, answer.sizes, indices) or differences(own, answer.draws, indices)
     return {
         "mechanism": candidate.title if candidate else step.name,
         "group": candidate.group if candidate else "",

@@ -293,11 +293,11 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
         kept = replace(kept, named=replace(last, tests=tests))
     results = replace(results, kept=kept).after(GAIN)
     yield results
-    small = bool(kept.named.steps) and _leaves_little(problem, kept.named)
-    results = replace(results, small=small)
-    verdict = _verdict(kept, problem, ended=True, small=small)
     passes = kept.named.test_series[-1].omnibus.p > problem.rules.extended_passes
-    if verdict in (PARTLY, UNEXPLAINED) and not passes:
+    small = bool(kept.named.steps) and not passes and _leaves_little(problem, kept.named)
+    results, suffices = replace(results, small=small), passes or small
+    verdict = _verdict(kept, problem, ended=True, small=small)
+    if verdict in (PARTLY, UNEXPLAINED) and not suffices:
         stated = search.target.measured
         if stated.noise.source == STATED:  # would the base model pass under a noise fitted to its residuals?
             other, fit = under_residual_noise(stated, as_measured(last.search.target, last.base))
@@ -306,8 +306,9 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
             results = replace(results, suspected=other.noise if passing else None)
         yield results
     # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that
-    # passes the joint test leaves nothing to describe, even if the explained fraction is uncertain.
-    if verdict == UNEXPLAINED or (verdict == PARTLY and not passes) or (verdict == NO_VERDICT and not base.converged):
+    # passes the joint test, or leaves too little to matter, leaves nothing to describe, even if the explained fraction
+    # is uncertain.
+    if verdict == UNEXPLAINED or (verdict == PARTLY and not suffices) or (verdict == NO_VERDICT and not base.converged):
         # Mechanisms that unseen recordings do not support may make a law visible, which then replaces them.
         for described in describe(problem, last, kept.held_out, report):
             results = replace(results, described=described)

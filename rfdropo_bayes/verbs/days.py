@@ -60,11 +60,11 @@ def pieces_of(
         days: numbers of the recordings of each day; empty for one day.
         rests: whether every row is an equilibrium; a fit may then leave out rows.
         timed: whether rows have times.
+        kept: number of recordings that were named for the test.
     """
     groups = list(days.values()) or [range(len(counts))]
     alone = [group[0] for group in groups if not kept and len(group) == 1 and counts[group[0]] >= FEWEST_ROWS]
-    tested = {number for group in groups for number in last_third(group)}
-    tested = set(range(len(counts) - kept, len(counts))) if kept else tested
+    tested = set(range(len(counts))[-kept:] if kept else (k for group in groups for k in last_third(group)))
     fitted = sum(
         (2 * count // 3 if number in alone and timed else count)
         for number, count in enumerate(counts)

@@ -411,7 +411,8 @@ def data_tables(
         "[data]",
         f'format = "{guess.format}"',
         f"fit = [{', '.join(fit)}]",
-        f"test = [{', '.join(test)}]" + (f"  # {'' if kept else 'ASSUMED: '}no fit sees them" if test else ""),
+        f"test = [{', '.join(test)}]"
+        + ("" if kept or not test else "  # ASSUMED: kept from the fit; --test names others"),
         *masked,
         "",
         "# Guessed from the names and sizes of the columns: look them over.",

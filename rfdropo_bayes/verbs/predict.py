@@ -21,7 +21,7 @@ from rfdropo_bayes.data import (
     Trajectory,
     commands_alone,
     first_row_only,
-    load_commanded,
+    load_unseen,
     start_is_known,
 )
 from rfdropo_bayes.data.given_recordings import given_recording
@@ -69,7 +69,7 @@ def predict(
         commands: a recording, of which only the commands and the first row are used; the name of a file in the format
             of the model's experiment; or a pair of times [s] and commands (time, channel), in the robot's unit.
         start: positions of the markers in the first row [m], (marker, 3), if commands are a pair; if commands are a
-            file without observations, the file that has them (see `load_commanded`); unknown by default.
+            file without observations, the file that has them (see `load_unseen`); unknown by default.
         episode: number of the episode, if the file is a LeRobotDataset.
         draws: number of posterior draws to simulate.
         seed: seed of random numbers; by default from the model's experiment.
@@ -106,7 +106,7 @@ def predict(
             remedy = "name the format of the commands"
             raise InputError("the experiment has no [data]", where=path, remedy=remedy)
         begun = record.attrs.get(BEGUN)
-        given = load_commanded(data, model.folder, str(commands), start, begun=begun, episode=episode)
+        given = load_unseen(data, model.folder, str(commands), start, begun=begun, episode=episode)
     else:
         given = given_recording(commands, "predict")
     unseen = first_row_only(given)  # a prediction knows no later row

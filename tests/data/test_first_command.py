@@ -11,6 +11,7 @@ from rfdropo_bayes.data import (
     Origin,
     SentCommands,
     Trajectory,
+    first_row_only,
     load_recordings,
     load_unseen,
     read_asl_csv,
@@ -160,6 +161,6 @@ def test_motors_show_where_they_stand_before_the_first_command(asl_tables, write
     for found in (load_recordings(spec, tmp_path)[0], load_unseen(spec, tmp_path, "c.csv", "o.csv", begun="zero")):
         np.testing.assert_allclose(np.rad2deg(found.initial_command), turned[0])
         assert found.first_command.endswith("rad (the motors' angles in the first row)")
-    assert found.motor_angle is None
+    assert first_row_only(found).motor_angle is None
     given = load_recordings(DataSpec.parse({"format": "asl-csv", "fit": [entry], "initial_command": "zero"}), tmp_path)
     assert not given[0].initial_command.any()

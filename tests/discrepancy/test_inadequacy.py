@@ -115,3 +115,19 @@ def test_beside_a_misspecified_model_only_quick_residuals_are_noise(before, left
         for source, rho in ((before, 0.0), (left, memory))
     )
     assert leaves_noise(first, second) == noise
+
+
+def test_bands_have_the_size_of_what_their_own_model_leaves_and_not_of_the_model_that_gave_the_noise():
+    """Without repeats the noise is the residuals' of an earlier model, here twice what the last model leaves."""
+    measured = first_target(problem(TRUTH, 3), Journal())
+    errors = NOISE * np.random.default_rng(0).standard_normal(measured.measurements.count.shape)
+    own = {"known": None, "measurements": measured.measurements, "errors": lambda x: errors}
+    deviations = {
+        source: residual_deviation(
+            SimpleNamespace(noise=SimpleNamespace(source=source, scale=np.full(errors.shape[-1], 2.0 * NOISE)), **own),
+            SimpleNamespace(x=None),
+        )
+        for source in (RESIDUALS, REPEATS)
+    }
+    np.testing.assert_allclose(deviations[RESIDUALS], NOISE, rtol=0.05)
+    np.testing.assert_allclose(deviations[REPEATS], 2.0 * NOISE)

@@ -138,7 +138,9 @@ def test_the_last_third_is_the_test_unless_recordings_are_named_for_it(tmp_path,
     monkeypatch.chdir(tmp_path)
     status, told = init(monkeypatch, capsys, "arm", "--recording", "run_*.csv")
     assert status == 0
-    assert 'look over: test = ["../run_6.csv", "../run_7.csv"]  # ASSUMED: no fit sees them' in told
+    assert (
+        'look over: test = ["../run_6.csv", "../run_7.csv"]  # ASSUMED: kept from the fit; --test names others' in told
+    )
     status, told = init(monkeypatch, capsys, "other", "--recording", "run_*.csv", "--test", "run_[25].csv")
     assert status == 0
     assert "test =" not in told
