@@ -37,6 +37,7 @@ WHOLE = "with_whole_library"
 LEARNT = 0.5  # of a prior's deviation that a posterior's is below where the data, not the prior, say the size
 TRIES = 8  # mechanisms that are tried until one reaches the wanted size
 FAMILIES = {
+    "actuator_lag": "cable_lag",
     "command_delay": "cable_delay",
     "command_gain": "cable_gain",
     "command_gain_drift": "cable_gain_drift",

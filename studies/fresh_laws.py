@@ -9,7 +9,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.mechanisms.actuation import NUMBERED, kept_over
+from rfdropo_bayes.mechanisms.actuation import NUMBERED
 from rfdropo_bayes.mechanisms.default_priors import half_normal
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
@@ -82,24 +82,6 @@ class SlippingCable(CableEffect, SteppedActuation):
         return (given, way), given - self.sizes(values, len(given)) * way
 
 
-class LaggingCable(CableEffect, SteppedActuation):
-    """A single drive follows its command as a first-order lag."""
-
-    name = "fresh_lag"
-    size = _size(name, "s", 5.0, 0.1, "time constant of one drive")
-
-    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
-        """Where the drives stand."""
-        return first
-
-    def advance(
-        self, values: Values, memory: Float[Array, " channel"], given: Float[Array, " channel"], now: float
-    ) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
-        """Follow the command."""
-        reached = given + kept_over(now, self.sizes(values, len(given))) * (memory - given)
-        return reached, reached
-
-
 class HystereticCable(CableEffect, SteppedActuation):
     """A cable lags behind its drive by the hysteresis of Bouc and Wen, which saturates at the size [m]."""
 
@@ -121,4 +103,4 @@ class HystereticCable(CableEffect, SteppedActuation):
         return (given, state), given - self.sizes(values, len(given)) * state
 
 
-LAWS = (Crosstalk, SlippingCable, LaggingCable, HystereticCable)
+LAWS = (Crosstalk, SlippingCable, HystereticCable)

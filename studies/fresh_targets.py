@@ -23,7 +23,7 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Mechanism
 from rfdropo_bayes.verbs.simulate import simulate
-from studies.fresh_laws import LAWS, CableEffect, HystereticCable, LaggingCable
+from studies.fresh_laws import LAWS, CableEffect, HystereticCable
 from studies.mujoco_truth import ENGINE_EFFECTS, arm_xml, write_arm
 
 KINDS = ("library", "unknown", "mujoco")
@@ -75,8 +75,8 @@ SCENES = {
         {"duration": 5.0, "interval": 0.05, "step": 0.005, "low": 0.0, "high": 0.02, "sample_time": 0.05},
         finer={"refine": 2, "time_step": 0.005},
     ),
-    # Recorded before the cube is put there; its mass and its friction are known, and nominal. The other two laws grow
-    # with commands, which are up to 70 mm here: with the usual crosstalk no training of a target learns to push.
+    # Recorded before the cube is put there; its mass and its friction are known, and nominal. The other laws grow with
+    # commands, which are up to 70 mm here: with the usual crosstalk no training of a target learns to push.
     "push": Scene(
         "virtual_trunk",
         {
@@ -88,7 +88,7 @@ SCENES = {
         {"duration": 3.0, "interval": 0.05, "step": 0.005, "low": 0.0, "high": 0.04, "sample_time": 0.05},
         simulated={"integrator": "euler"},
         flawed=4,
-        laws=(LaggingCable, HystereticCable),
+        laws=(HystereticCable,),
     ),
 }
 
@@ -100,7 +100,7 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
     its recordings are written again.
 
     Args:
-        kind: "library", three mechanisms of the library, their sizes drawn from their priors; "unknown", two laws
+        kind: "library", three mechanisms of the library, their sizes drawn from their priors; "unknown", one or two laws
             that the library lacks, each of as many cables as the scene says, as large as usual to twice as large; or
             "mujoco", an arm that MuJoCo moves with two effects of its own, as large. Only the arm that reaches can be
             made in MuJoCo.
@@ -194,8 +194,9 @@ def _from_library(scene: Scene, rng: np.random.Generator) -> tuple[list[str], di
 
 def _unknown(scene: Scene, rng: np.random.Generator) -> tuple[list[str], dict[str, float]]:
     """Names of laws, and the sizes of each at the cables on which it acts."""
+    count = min(UNKNOWN, len(scene.laws))
     kinds: list[type[CableEffect]] = [
-        scene.laws[k] for k in sorted(rng.choice(len(scene.laws), UNKNOWN, replace=False))
+        scene.laws[k] for k in sorted(rng.choice(len(scene.laws), count, replace=False))
     ]
     names = [f"{kind.__module__}:{kind.__qualname__}" for kind in kinds]
     sizes = {}

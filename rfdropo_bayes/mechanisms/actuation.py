@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.mechanisms.default_priors import half_normal, log_normal, normal
+from rfdropo_bayes.mechanisms.first_order import first_order
 from rfdropo_bayes.mechanisms.sizes import USUAL, scaled
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.cable import Cable
@@ -54,12 +55,6 @@ def in_unit(spec: ParameterSpec, unit: str, per_metre: float) -> ParameterSpec:
     """
     word = {"-": "1", "N m": "(N m)"}.get(unit, unit) if "/" in spec.unit else unit
     return scaled(spec, per_metre ** POWERS[spec.unit])._replace(unit=word.join(spec.unit.rsplit("m", 1)))
-
-
-def kept_over(time_step: float, time_constant: Float[Array, ""]) -> Float[Array, ""]:
-    """Share of a first-order filter's distance from a held input that is left after a step; none at tau = 0."""
-    memory = time_constant > 1e-3 * time_step  # exp(-1000) is zero in any precision
-    return jnp.where(memory, jnp.exp(-time_step / jnp.where(memory, time_constant, 1.0)), 0.0)
 
 
 class CommandDelay:
@@ -149,28 +144,56 @@ def _read_late(
 
 
 class ActuatorLag(SteppedActuation):
-    """First-order lag of the drives, ``tau y' = u - y`` with u held over each step; tau = 0 is the base simulator.
-
-    A lag much shorter than a time step changes nothing that can be seen: the derivative at tau = 0 is zero.
-    """
+    """First-order lag of the drives, ``tau y' = u - y``; tau = 0 is the base simulator."""
 
     name = "actuator_lag"
     stage = "actuation"
     inside_drive = True
     cause = "bandwidth of the position loop of the drives"
     remedy = "stiffen the position loop, or keep the lag in the model"
-    parameters = (ParameterSpec("actuator_lag", "s", 0.0, 5.0, 0.0, half_normal(0.2), "time constant of the lag"),)
+    parameters: tuple[ParameterSpec, ...] = (
+        ParameterSpec("actuator_lag", "s", 0.0, 5.0, 0.0, half_normal(0.2), "time constant of the lag"),
+    )
 
-    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> Float[Array, " channel"]:
-        """Position of the drives."""
-        return first
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
+        """Position of the drives, and the last command."""
+        return first, first
 
     def advance(
-        self, values: Values, memory: Float[Array, " channel"], given: Float[Array, " channel"], now: float
-    ) -> tuple[Float[Array, " channel"], Float[Array, " channel"]]:
+        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
         """Follow the command, starting from rest at its initial value."""
-        reached = given + kept_over(now, values["actuator_lag"]) * (memory - given)
-        return reached, reached
+        reached = first_order(*memory, given, now, self._times(values, len(given)))
+        return (reached, given), reached
+
+    def _times(self, values: Values, channels: int) -> Float[Array, "*channel"]:
+        return values["actuator_lag"]
+
+
+class CableLag(ActuatorLag):
+    """Each drive follows with a first-order lag of its own; zero at null. Equal lags of all are `actuator_lag`'s.
+
+    Args:
+        channels: names of the command channels; numbers by default.
+    """
+
+    name = "cable_lag"
+    cause = "a drive that follows more slowly than others: its load, its gains, or friction of its cable"
+    remedy = "step each drive alone, and compare the rise of their encoders"
+
+    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
+        self.parameters = tuple(
+            ParameterSpec(f"cable_lag_{channel}", "s", 0.0, 5.0, 0.0, half_normal(0.2), f"time constant of {channel}")
+            for channel in channels
+        )
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> CableLag:
+        """One lag for every command channel of a robot."""
+        return cls(robot.channel_names)
+
+    def _times(self, values: Values, channels: int) -> Float[Array, "*channel"]:
+        return jnp.stack([values[spec.name] for spec in self.parameters[:channels]])
 
 
 class CommandGain(MemorylessActuation):
@@ -440,18 +463,17 @@ class DriveCreep(SteppedActuation):
         ),
     )
 
-    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array]:
-        """The slowly following command, and its start."""
-        return first, first
+    def begin(self, values: Values, first: Float[Array, " channel"], interval: float) -> tuple[Array, Array, Array]:
+        """The slowly following command, the last command, and the first."""
+        return first, first, first
 
     def advance(
-        self, values: Values, memory: tuple[Array, Array], given: Float[Array, " channel"], now: float
-    ) -> tuple[tuple[Array, Array], Float[Array, " channel"]]:
+        self, values: Values, memory: tuple[Array, Array, Array], given: Float[Array, " channel"], now: float
+    ) -> tuple[tuple[Array, Array, Array], Float[Array, " channel"]]:
         """Take away a share of the slowly following command."""
-        slow, start = memory
-        kept = kept_over(now, values["drive_creep_time"])
-        slow = given + kept * (slow - given)
-        return (slow, start), given - values["drive_creep"] * (slow - start)
+        slow, last, start = memory
+        followed = first_order(slow, last, given, now, values["drive_creep_time"])
+        return (followed, given, start), given - values["drive_creep"] * (followed - start)
 
 
 class GuideAzimuth(MemorylessActuation):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.mechanisms.first_order import first_order
 from rfdropo_bayes.tables import nearest
 
 REST = 1e-9  # m or rad per step: less is the rounding of a command that is held
@@ -120,8 +121,8 @@ class Feature(NamedTuple):
             "drift": zero,
             "rate": own,
             "direction": [*own, zero],
-            "low_pass": own,
-            "lag": own,
+            "low_pass": [*own, *own],
+            "lag": [*own, *own],
             "play": [*own, zero],
             "largest": [jnp.abs(u) for u in own],
             "travelled": [*own, zero],
@@ -155,9 +156,8 @@ class Feature(NamedTuple):
             return own, (u - before) / interval
         if self.kind in ("low_pass", "lag"):
             assert self.shape is not None
-            kept = jnp.exp(-interval / self.shape)
-            slow = u + kept * (before - u)
-            return [slow], slow if self.kind == "low_pass" else u - slow
+            slow = first_order(before, memory[1], u, interval, self.shape)
+            return [slow, u], slow if self.kind == "low_pass" else u - slow
         if self.kind == "largest":
             most = jnp.maximum(before, jnp.abs(u))
             return [most], most

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from rfdropo_bayes.mechanisms.default_priors import half_normal, normal
+from rfdropo_bayes.mechanisms.first_order import first_order
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
@@ -185,13 +186,7 @@ class SensorLag:
     ) -> tuple[tuple[Array, Array, Array], Float[Array, "marker 3"]]:
         """Exact response to a position that ran straight from the last position to this."""
         last, before, then = memory
-        tau = values["sensor_lag"]
-        on = tau > 0.0
-        safe = jnp.where(on, tau, 1.0)
-        gap = jnp.maximum(now - then, 1e-9)
-        slope = (given - before) / gap
-        kept = jnp.where(on, jnp.exp(-gap / safe), 0.0)
-        seen = given - tau * slope + kept * (last - before + tau * slope)
+        seen = first_order(last, before, given, jnp.maximum(now - then, 1e-9), values["sensor_lag"])
         return (seen, given, jnp.asarray(now, float)), seen
 
 

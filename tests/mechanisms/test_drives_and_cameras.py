@@ -29,6 +29,7 @@ POSITION = jnp.asarray(np.random.default_rng(1).normal(size=(80, 4, 3)).cumsum(a
 DRIVES = (
     "backlash",
     "cable_gain",
+    "cable_lag",
     "cable_slack",
     "drive_creep",
     "cable_gain_drift",
@@ -89,7 +90,7 @@ def test_the_null_value_is_the_base_simulator_and_its_derivative_is_the_one_side
         assert np.isfinite(slope).all()
         difference = (act(null | {spec.name: null[spec.name] + step}) - there) / step
         np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=2e-5)
-        channel = spec.name.removesuffix("_rate").removeprefix("cable_gain_error_")
+        channel = spec.name.removesuffix("_rate").removeprefix("cable_gain_error_").removeprefix("cable_lag_")
         channels_beyond = channel.isdigit() and int(channel) > COMMAND.shape[1]
         if not spec.grid and not channels_beyond:
             assert np.abs(slope).max() > 0
@@ -138,12 +139,12 @@ def test_each_cable_has_its_own_gain_and_a_wrong_one_leaves_the_others_alone():
 
 
 def test_a_held_command_creeps_exponentially():
-    """The loss is g (1 - exp(-t / tau)), whatever the time step."""
-    held = jnp.full((60, 1), 0.01)
-    values = {"drive_creep": jnp.asarray(0.2), "drive_creep_time": jnp.asarray(0.3)}
+    """After a pull of one step the loss is g (1 - exp(-t / tau) m), m = (exp(s / tau) - 1) tau / s in steps of s."""
+    held, tau = jnp.full((60, 1), 0.01), 0.3
+    values = {"drive_creep": jnp.asarray(0.2), "drive_creep_time": jnp.asarray(tau)}
     crept = REGISTRY["drive_creep"]().actuate(values, held, jnp.zeros(1), STEP)[:, 0]
-    k = np.arange(1, 61)
-    np.testing.assert_allclose(crept, 0.01 * (1 - 0.2 * (1 - np.exp(-k * STEP / 0.3))), rtol=1e-12)
+    left = np.exp(-np.arange(1, 61) * STEP / tau) * np.expm1(STEP / tau) * tau / STEP
+    np.testing.assert_allclose(crept, 0.01 * (1 - 0.2 * (1 - left)), rtol=1e-12)
 
 
 def test_a_lagging_camera_answers_a_ramp_in_closed_form():
