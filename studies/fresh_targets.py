@@ -100,7 +100,7 @@ def make_target(kind: str, seed: int, out: Path, scene: str = "reach") -> dict[s
     its recordings are written again.
 
     Args:
-        kind: "library", three mechanisms of the library, their sizes drawn from their priors; "unknown", one or two laws
+        kind: "library", three mechanisms of the library, sizes drawn from their priors; "unknown", one or two laws
             that the library lacks, each of as many cables as the scene says, as large as usual to twice as large; or
             "mujoco", an arm that MuJoCo moves with two effects of its own, as large. Only the arm that reaches can be
             made in MuJoCo.
@@ -195,9 +195,7 @@ def _from_library(scene: Scene, rng: np.random.Generator) -> tuple[list[str], di
 def _unknown(scene: Scene, rng: np.random.Generator) -> tuple[list[str], dict[str, float]]:
     """Names of laws, and the sizes of each at the cables on which it acts."""
     count = min(UNKNOWN, len(scene.laws))
-    kinds: list[type[CableEffect]] = [
-        scene.laws[k] for k in sorted(rng.choice(len(scene.laws), count, replace=False))
-    ]
+    kinds: list[type[CableEffect]] = [scene.laws[k] for k in sorted(rng.choice(len(scene.laws), count, replace=False))]
     names = [f"{kind.__module__}:{kind.__qualname__}" for kind in kinds]
     sizes = {}
     for mechanism in _made(scene, names):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpyro.infer.util import log_density
 from scipy import stats
+from scipy.signal import StateSpace, lsim
 
 from rfdropo_bayes.bayes.calibration_problem import CalibrationProblem
 from rfdropo_bayes.bayes.channels import Markers, MotorAngle
@@ -110,9 +111,12 @@ def test_the_density_of_the_angles_is_that_of_normals_at_new_readings_only():
     chosen, plain = problem(read), problem(read, angles=False)
     values = batch(actuator_lag=0.05, motor_angle_noise=0.01)
     with_angles, without = chosen.row_log_likelihood(values, 60)[0][0], plain.row_log_likelihood(values, 60)[0][0]
-    drive, kept = read.initial_command, np.exp(-STEP / 0.05)
-    for row in range(1, 60):
-        drive = read.command[row - 1] + kept * (drive - read.command[row - 1])  # held over each step
+    sent = np.concatenate([read.initial_command[None], read.command[:59]])  # runs straight from step to step
+    drives = [
+        lsim(StateSpace(-1.0 / 0.05, 1.0 / 0.05, 1.0, 0.0), column, STEP * np.arange(60), X0=column[0])[1]
+        for column in sent.T
+    ]
+    for row, drive in enumerate(np.transpose(drives)[1:], start=1):
         new = row % 3 == 0
         expected = stats.norm.logpdf(read.motor_angle[row], drive, 0.01).sum() if new else 0.0
         assert with_angles[row] - without[row] == pytest.approx(expected, abs=1e-9)

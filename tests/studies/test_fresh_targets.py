@@ -74,7 +74,7 @@ def test_a_target_in_mujoco_is_played_by_policies_of_our_body(tmp_path) -> None:
     files = make_target("mujoco", 0, tmp_path)
     truth, fitted = (Model.read(files[name]) for name in ("truth", "reach"))
     model = draw_flaws("mujoco", 0)
-    assert model["mechanisms"] == ["studies.fresh_laws:HystereticCable"]
+    assert len(model["mechanisms"]) == 2
     assert not set(model["mechanisms"]) & set(files["truth"].read_text().split('"'))
     first = fitted.recordings("fit")[0]
     assert np.ptp(first.position[:, -1], axis=0).max() > 0.01
