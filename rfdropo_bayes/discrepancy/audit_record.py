@@ -313,6 +313,7 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
             "title": f"{own.name}{relation}",
             "parameter": name,
             "power": power,
+            "young_modulus": named[STIFFNESS],
             "mean": ratio,
             "sd": abs(ratio) * deviation,
             "q05": min(low, high),

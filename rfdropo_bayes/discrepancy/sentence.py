@@ -289,11 +289,20 @@ def _named(finding: dict[str, Any]) -> str:
     name = finding["mechanism"].replace("_", " ") + (f" in {finding['group']}" if finding["group"] else "")
     if finding["mechanism"] == DISCRETISATION:
         return "the coarse mesh or time step"
-    # If cables leave the common scale of forces and stiffness free, only the ratio has a meaning.
-    ratios = {row["parameter"]: (title, row) for title, row in finding["relative"].items()}
-    given = [ratios.get(name, (name, row)) for name, row in finding["parameters"].items()]
-    surest = sorted(given, key=lambda entry: -abs(entry[1]["mean"]) / max(entry[1]["sd"], 1e-300))[:MOST_SIZES]
-    sizes = ", ".join(_size(row) for title, row in given if (title, row) in surest)
+    given = finding["parameters"]
+    measured = {row["parameter"]: row for row in finding["relative"].values()}
+    # If cables leave the common scale of forces and stiffness free, a ratio to Young's modulus is surer than its parts.
+    ratios = {name: row for name, row in measured.items() if row["power"]}
+    of_ratio = {
+        name: given[name] | {key: row[key] * row["young_modulus"] ** row["power"] for key in ("mean", "sd")}
+        for name, row in ratios.items()
+    }
+    rows = given | measured | of_ratio
+    surest = sorted(given, key=lambda name: -abs(rows[name]["mean"]) / max(rows[name]["sd"], 1e-300))[:MOST_SIZES]
+    sizes = ", ".join(_size(rows[name]) for name in given if name in surest)
+    if set(surest) & set(ratios):
+        modulus = next(iter(ratios.values()))["young_modulus"]
+        sizes += f" for a Young's modulus of {modulus / 1e6:.3g} MPa, as the data show the ratio"
     others = [spoken(other) for other in finding["equivalence_class"][1:]]
     alike = f" (indistinguishable from {', '.join(others)} in these data)" if others else ""
     return f"{name} ({sizes}){alike}"

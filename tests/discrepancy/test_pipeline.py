@@ -759,6 +759,16 @@ def test_of_many_sizes_the_surest_are_said_in_their_order():
     assert re.findall(r"size (\d)", _named(finding)) == ["1", "2", "4", "5"]
 
 
+def test_of_a_mass_whose_ratio_to_the_modulus_is_seen_the_size_at_that_modulus_is_said():
+    """A payload of 6 ± 2 g by itself, whose ratio to the modulus is known to 1 %."""
+    load = {"title": "payload", "mean": 6e-3, "sd": 2e-3, "unit": "kg"}
+    ratio = load | {"parameter": "payload", "power": 1, "young_modulus": 2e6, "mean": 3.1e-9, "sd": 3.1e-11}
+    finding = {"mechanism": "load", "group": "", "parameters": {"payload": load}, "equivalence_class": ["load"]}
+    assert _named(finding | {"relative": {"payload_over_young_modulus": ratio}}) == (
+        "load (payload 0.0062 \u00b1 6.2e-05 kg for a Young's modulus of 2 MPa, as the data show the ratio)"
+    )
+
+
 @pytest.mark.parametrize("common", [0.07, 0.001])
 def test_a_member_of_a_family_is_said_beside_the_others_if_only_that_is_known(common):
     """Gains of four cables beside a gain of all drives: the first is 12 % off the others to .3 %, and by itself to
