@@ -10,7 +10,7 @@ prior, or from the optimum of `start`, the folder of a calibration: a day that i
 and nothing else. `set` changes entries of the experiment, as ``--set`` does.
 
 Every line of DIR/ledger.jsonl has the figures of a day: how far the last marker is off [mm], before an adaptation (from
-the first row, in the same rows) and after it, and the share of the measured coordinates lies in the 90 % bands: of
+the first row, in the same rows) and after it, and the share of the measured coordinates in the 90 % bands: of
 all markers, of the last, and of rows whose last marker is inside in all three.
 Lines that are there are not computed again, fits that are done are read again, and so an interrupted run goes on. A fit
 of the paper's trunk takes 2 to 10 minutes of two shared cores, one of the ASL trunk 7 minutes or more, an adaptation 1.
