@@ -2,9 +2,9 @@
 
 Writes recordings as a laboratory has them: commands in counts of encoders, positions in millimetres in a frame whose y
 axis points up, columns of their own names. They are simulated, of an arm with four cables whose commands arrive 70 ms
-late, which no file mentions. Then every command that the README names is typed, from init to predict, and the axes that
-check offers are pasted into the experiment file. Prints words read, words typed and the time of each command, and fails
-if the audit does not name the delay, or if the prediction is off. See docs/tutorial.md.
+late, which no file mentions. Then every command that the README names is typed, from init to predict. Prints words
+read, words typed and the time of each command, and fails if the audit does not name the delay, or if the prediction is
+off. See docs/tutorial.md.
 
     python benchmarks/fifteen_minutes.py FOLDER [--look]        (6 minutes of one processor)
 """
@@ -17,12 +17,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
 import json
-import re
 import shlex
 import subprocess
 import sys
 import time
-import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,14 +39,11 @@ COMMANDS = (
     'rfdropo init finger --recording "data/*.csv" --length-mm 250 --radius-mm 12 --segments 1 --mass-g 90 '
     "--counts-per-turn 4096 --spool-radius-mm 12 --gravity +z --defaults",
     "rfdropo check finger/experiment.toml",
-    "rfdropo check finger/experiment.toml --out runs/again",
     "rfdropo calibrate finger/experiment.toml --set inference.method=laplace --out runs/arm",
     "rfdropo audit finger/experiment.toml --from runs/arm --out runs/audit --set audit.minutes=300",
     "rfdropo calibrate runs/audit/extended.toml --set inference.method=laplace --out runs/mended",
     "rfdropo predict runs/mended --commands data/trial_03.csv --out runs/next",
 )
-PASTED = 1
-"""The command after which the axes that it offers are pasted into the experiment file."""
 
 
 class Step(NamedTuple):
@@ -75,13 +70,11 @@ def main() -> None:
 
 
 def type_all(folder: Path) -> list[Step]:
-    """Type every command, and paste what check offers."""
+    """Type every command."""
     steps = []
-    for number, command in enumerate(COMMANDS):
+    for command in COMMANDS:
         steps.append(typed(command, folder))
         print(f"{steps[-1].wall:6.0f} s {steps[-1].cpu:6.0f} s of processor  {command}", flush=True)
-        if number == PASTED:
-            paste_axes(folder / "finger" / "experiment.toml", folder / "runs" / "finger-check" / "check.json")
     return steps
 
 
@@ -123,19 +116,6 @@ def typed(command: str, folder: Path) -> Step:
     return Step(command, len(done.stdout.split()), time.perf_counter() - began, cpu)
 
 
-def paste_axes(experiment: Path, told: Path) -> None:
-    """Put the axes that check offers into the experiment file.
-
-    Raises:
-        RuntimeError: it offers none.
-    """
-    offered = re.search(r"axes = \[[^]]*\]", " ".join(json.loads(told.read_text(encoding="utf-8"))["doubts"]))
-    if offered is None:
-        raise RuntimeError("check did not see that the frame is turned")
-    text = experiment.read_text(encoding="utf-8")
-    experiment.write_text(re.sub(r"axes = \[[^]]*\]", offered[0], text), encoding="utf-8")
-
-
 def table(steps: list[Step]) -> str:
     """Minutes of reading, typing and waiting."""
     read = len(README.read_text(encoding="utf-8").split())
@@ -160,8 +140,7 @@ def table(steps: list[Step]) -> str:
 def see(folder: Path) -> None:
     """Assert that the delay was named and measured, and that the prediction errs by little more than noise."""
     audit = json.loads((folder / "runs" / "audit" / "audit.json").read_text(encoding="utf-8"))
-    extended = tomllib.loads((folder / "runs" / "audit" / "extended.toml").read_text(encoding="utf-8"))
-    (named,) = extended["model"]["mechanisms"]
+    (named,) = audit["adopted"]
     row = rb.load(folder / "runs" / "mended").summary.loc[named]
     print(audit["sentence"])
     print(f"{named} {row['mean']:.5f} +- {row['sd']:.5f} s; hidden was a command_delay of {DELAY} s")

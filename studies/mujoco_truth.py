@@ -345,13 +345,14 @@ class EngineArm(ABC):
 
 @dataclass(frozen=True)
 class MuJoCoArm(EngineArm):
-    """The robot in MuJoCo; its values and links are those of `arm_xml`."""
+    """The robot in MuJoCo; its values, links and step, a part of `CONTROL`, are those of `arm_xml`."""
 
     links: int = LINKS
+    step: float = STEP
 
     def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
         mujoco = engine()
-        model = mujoco.MjModel.from_xml_string(arm_xml(self.robot, self.values, self.links))
+        model = mujoco.MjModel.from_xml_string(arm_xml(self.robot, self.values, self.links, self.step))
         effect = self.effect
         if effect is not None and effect.model is not None:
             effect.model(model, size)
@@ -363,7 +364,7 @@ class MuJoCoArm(EngineArm):
             mujoco.mj_kinematics(model, data)
             path[row] = data.site_xpos[markers]
             data.ctrl[:] = level
-            mujoco.mj_step(model, data, nstep=round(CONTROL / STEP))
+            mujoco.mj_step(model, data, nstep=round(CONTROL / self.step))
         if any(warning.number for warning in data.warning) or not np.isfinite(path).all():
             raise InputError("MuJoCo warns of the motion", where=recording.name, remedy="make the effect smaller")
         return seen_at(recording, clock, path, effect, size)
