@@ -129,9 +129,8 @@ def main() -> None:
             f"{mm:g} mm: {'not reached' if cost is None else f'{1e3 * cost:.3g} ms'}"
             for mm, cost in zip(ALLOWED, enough, strict=True)
         ]
-        print(
-            f"| *{settings[0].name.split(',')[0]}* | orders {', '.join(f'{o:.2f}' for o in orders)} | {'; '.join(words)} |"
-        )
+        name, order = settings[0].name.split(",")[0], ", ".join(f"{o:.2f}" for o in orders)
+        print(f"| *{name}* | orders {order} | {'; '.join(words)} |")
     print()
     subprocess.run([sys.executable, str(Path(__file__).parents[1] / "tools/yardstick.py")], check=True)
 
