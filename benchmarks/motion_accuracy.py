@@ -35,7 +35,7 @@ ROBOT = "smooth_arm"
 ALLOWED = (1.0, 0.1)  # mm
 OURS = ((1, 20.0), (1, 10.0), (2, 10.0), (4, 5.0), (8, 5.0))  # elements for each of the robot's own, steps [ms]
 FINEST_MS = 2.5  # [ms] of the series that has our limit
-LINKS = {5: (1e-3, 5e-4, 2.5e-4), 10: (1e-3, 5e-4, 2.5e-4), 20: (2.5e-4, 1e-4), 40: (5e-5, 2.5e-5)}  # steps [s]
+LINKS = {5: (1e-3, 5e-4, 2.5e-4), 10: (1e-3, 5e-4, 2.5e-4), 20: (2.5e-4, 1e-4), 40: (5e-5,)}  # steps [s]
 ELEMENTS = (5, 10, 20)
 Path3 = Float[np.ndarray, "time 3"]
 
@@ -85,6 +85,7 @@ def timed(arm: Callable[[], EngineArm], recording: Trajectory, name: str) -> Set
         began = time.process_time()
         path = arm().positions([recording], 0.0)[0, 1:, -1]
         cost = min(cost, time.process_time() - began)
+    print(f"{name}: {cost:.3g} s", file=sys.stderr, flush=True)
     return Setting(name, path, cost)
 
 

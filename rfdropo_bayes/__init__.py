@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from rfdropo_bayes.deployment.settings import load_deployment as load_deployment
     from rfdropo_bayes.errors import InputError as InputError
     from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig as Laplace
-    from rfdropo_bayes.inference.nested import NestedConfig as Nested
-    from rfdropo_bayes.inference.nuts import NutsConfig as NUTS
     from rfdropo_bayes.inference.rfdropo.phi_search import RfdropoConfig as RFDROPO
     from rfdropo_bayes.inference.smc.sampler import SmcConfig as SMC
     from rfdropo_bayes.model.model import Model as Model
@@ -79,8 +77,6 @@ _HOMES = {
     "Laplace": "inference.modes.mode_search:LaplaceConfig",
     "Model": "model.model",
     "MuJoCo": "simulators.adapters.mujoco_model",
-    "NUTS": "inference.nuts:NutsConfig",
-    "Nested": "inference.nested:NestedConfig",
     "Parameter": "robots.parameter",
     "ParameterSpec": "simulators.parameters",
     "Prediction": "results.predicted",

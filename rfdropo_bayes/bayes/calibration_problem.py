@@ -200,15 +200,6 @@ class CalibrationProblem:
         status = np.where((status == Result.OK) & ~finite, Result.DIVERGED, status)
         return np.where((status == Result.OK)[:, None], rows, -np.inf), status
 
-    def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
-        """Log likelihood of all rows at one unconstrained point; minus infinity after a failed rollout.
-
-        Traceable; differentiable in reverse mode if the engine is.
-        """
-        values = {name: value[0] for name, value in self.from_unconstrained(u[None]).items()}
-        rows, status = self.model.row_log_likelihood(values, None, self.measured, self.shares)
-        return jnp.where(status == 0, jnp.sum(rows), -jnp.inf)
-
     def rollouts(
         self, values: Batch, horizon: int
     ) -> tuple[Float[np.ndarray, "n horizon feature"], Int[np.ndarray, " n"]]:

@@ -5,7 +5,6 @@ behind it.
 |---|---|
 | `Problem` | every method |
 | `ResidualProblem`, `BatchedResiduals` | Gauss-Newton optimisation |
-| `TraceableProblem` | NUTS, nested sampling |
 | `WarmStart` | optimisations from an earlier posterior |
 | `Hierarchy` | optimisations with standard deviations among the parameters |
 | `RolloutProblem` | RF-DROPO |
@@ -27,8 +26,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import DrawsByOwner
-
-LOWEST = -1e10  # density of a rollout that failed: finite, so that a gradient there is zero and not NaN
 
 # Arrays of JAX or of NumPy: a problem takes and returns both.
 Values = Mapping[str, Float[Any, " n"]]
@@ -137,15 +134,6 @@ class BatchedResiduals(ResidualProblem, Protocol):
 
     def residual_batch(self, values: Values, horizon: int) -> Float[Any, "n m"]:
         """`residuals` of many sets of values."""
-        ...
-
-
-@runtime_checkable
-class TraceableProblem(Problem, Protocol):
-    """A problem whose likelihood JAX can trace; NUTS also differentiates it."""
-
-    def log_likelihood_at(self, u: Float[Array, " d"]) -> Float[Array, ""]:
-        """Log likelihood of all rows at one unconstrained point."""
         ...
 
 
@@ -271,29 +259,8 @@ def with_rollouts(problem: Problem) -> RolloutProblem:
     return problem
 
 
-def traced_densities(problem: Problem) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Log prior and log likelihood of one unconstrained point, traceable.
-
-    Raises:
-        InputError: the problem has no likelihood that JAX can trace.
-    """
-    if not isinstance(problem, TraceableProblem):
-        what, remedy = "this problem has no likelihood that JAX can trace", 'use method = "smc"'
-        raise InputError(what, where="[inference] method", remedy=remedy)
-
-    def prior(u: Float[Array, " d"]) -> Float[Array, ""]:
-        return jnp.asarray(problem.log_prior(u[None]))[0]
-
-    def likelihood(u: Float[Array, " d"]) -> Float[Array, ""]:
-        value = problem.log_likelihood_at(u)
-        return jnp.where(jnp.isfinite(value), value, LOWEST)
-
-    return prior, likelihood
-
-
 CAPABILITIES: dict[str, type] = {
     "residuals": ResidualProblem,
-    "log_likelihood_at": TraceableProblem,
     "sample_starts": WarmStart,
     "scales": Hierarchy,
     "rollouts": RolloutProblem,

@@ -13,7 +13,6 @@ from jaxtyping import PRNGKeyArray
 
 from rfdropo_bayes.bayes.problem import Problem, check_problem
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.inference import nested, nuts
 from rfdropo_bayes.inference.modes import mode_search as laplace
 from rfdropo_bayes.inference.progress import Logbook, Progress
 from rfdropo_bayes.inference.result import InferenceResult
@@ -35,8 +34,6 @@ METHODS: dict[str, Method] = {
     "smc": Method(sampler.SmcConfig, starts.run),
     "rfdropo": Method(rfdropo.RfdropoConfig, rfdropo.run, posterior=False),
     "laplace": Method(laplace.LaplaceConfig, laplace.run),
-    "nuts": Method(nuts.NutsConfig, nuts.run),
-    "nested": Method(nested.NestedConfig, nested.run),
 }
 
 

@@ -11,7 +11,6 @@ from rfdropo_bayes.bayes.problem import (
     ProblemDefaults,
     ResidualProblem,
     RolloutProblem,
-    TraceableProblem,
     WarmStart,
     check_problem,
 )
@@ -63,7 +62,7 @@ def test_what_has_the_defaults_lacks_nothing():
     for problem in (LinearGaussian(), Decay(), Spring()):
         check_problem(problem)
         assert isinstance(problem, Problem)
-        assert not isinstance(problem, WarmStart | TraceableProblem)
+        assert not isinstance(problem, WarmStart)
     assert isinstance(LinearGaussian(), ResidualProblem)
     assert not isinstance(LinearGaussian(), RolloutProblem)
     assert isinstance(Spring(), RolloutProblem)

@@ -15,10 +15,8 @@ from rfdropo_bayes.inference.method_options import options_table
 
 from .toys import Decay, Spring
 
-# Those that need a gradient or a trace have tests of their own.
 # Studies add methods of their own as soon as a test imports them.
 OWN = [name for name, own in methods.METHODS.items() if own.config.__module__.startswith("rfdropo_bayes.")]
-OTHERS = ("nuts", "nested")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +59,7 @@ def test_ranges_of_a_search_are_written_as_lists():
     assert options_table(ranges)["search"] == {"a": [1.0, 2.0]}
 
 
-@pytest.mark.parametrize("method", [name for name in OWN if name not in OTHERS])
+@pytest.mark.parametrize("method", OWN)
 def test_every_method_answers_in_the_same_form(method):
     problem = Spring() if method == "rfdropo" else Decay(n_rows=20)
     options = {

@@ -27,8 +27,6 @@ SETTINGS = {
     "rfdropo": ["inference.rollouts=200", "inference.rollouts_per_candidate=4"],
     "smc": ["inference.rollouts=600", "inference.particles=50", "inference.blocks=2"],
     "laplace": ["inference.rollouts=300", "inference.starts=1", "inference.draws=40"],
-    "nested": ["inference.live=20"],
-    "nuts": ['simulator.engine="jax"', "inference.draws=4"],
 }
 
 
