@@ -101,11 +101,11 @@ def table1(folder: str) -> dict[str, Mapping[str, Any]]:
     return {f"{cell['task']} {cell['row']}": cell for cell in content["cells"] if cell["truths"] == "off-centre"}
 
 
-def policies(target: str, within: str = "15.25 mm") -> dict[str, str]:
+def policies(target: str, within: str = "15.25 mm", table: str = "table.md") -> dict[str, str]:
     """Share of episodes that end within a distance by row, with its 95 % interval, from the table of a target of
     `benchmarks/fresh_targets.py`.
     """
-    text = (REPORTS / "fresh_targets" / target / "table.md").read_text(encoding="utf-8")
+    text = (REPORTS / "fresh_targets" / target / table).read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
     column = rows[0].index(within)
     return {row[0]: row[column] for row in rows[1:]}
