@@ -8,13 +8,13 @@ Five kinds, each with its pattern in the numbers:
 - *held*: the tracker repeated its last pose. Real measurements carry noise in their last digits, so a position equal to
   its predecessor in all three coordinates is no new measurement. The first row of a held run counts as measured.
 - *jump*: the tracker fitted the wrong rigid body for a row or a short run of rows, and then came back; two markers that
-  swap for a row jump both. A jump is a step that differs from the neighbouring steps by more than ``tolerance +
-  max_acceleration * dt**2``. The longest smooth path of each marker is kept: the largest set of rows in which every row
-  can be reached from its predecessor. At most ``longest_run`` rows are left out at a time, so a lasting change of level
+  swap for a row jump both. A jump is a step that differs from the neighbouring steps by more than ``TOLERANCE +
+  MAX_ACCELERATION * dt**2``. The longest smooth path of each marker is kept: the largest set of rows in which every row
+  can be reached from its predecessor. At most ``LONGEST_RUN`` rows are left out at a time, so a lasting change of level
   (a moved frame, an impact) is kept and counted among the *breaks*.
 - *renamed*: the place of a marker under the name of another (`identities`).
 
-At low sampling rates ``max_acceleration * dt**2`` exceeds any motion: no row is masked then.
+At low sampling rates ``MAX_ACCELERATION * dt**2`` exceeds any motion: no row is masked then.
 """
 
 from __future__ import annotations
@@ -70,9 +70,6 @@ def find_faults(
     *,
     where: str = "recording",
     names: Sequence[str] = (),
-    tolerance: float = TOLERANCE,
-    max_acceleration: float = MAX_ACCELERATION,
-    longest_run: float = LONGEST_RUN,
 ) -> Faults:
     """Mask lost, held, jumping and renamed positions of a measured recording (not meant for simulated recordings).
 
@@ -81,9 +78,6 @@ def find_faults(
         position: marker positions [m]; NaN if a marker was lost.
         where: name of the recording in errors.
         names: marker names for the notes; numbers by default.
-        tolerance: distance that is no fault at any rate [m].
-        max_acceleration: largest acceleration a marker can have [m/s2].
-        longest_run: longest run of wrong positions that is distinguished from a lasting change [s].
 
     Raises:
         InputError: fewer than two rows, another number of positions than times, or times that do not increase.
@@ -97,7 +91,7 @@ def find_faults(
     breaks, clock = [], evenly_spaced(time)
     for marker in range(position.shape[1]):
         rows = np.flatnonzero(~(missing | held)[:, marker])
-        wrong, level_changes = _off_path(clock[rows], position[rows, marker], tolerance, max_acceleration, longest_run)
+        wrong, level_changes = _off_path(clock[rows], position[rows, marker])
         jumping[rows[wrong], marker] = True
         # a repeat of a wrong pose is as wrong as the pose; it is counted as held
         breaks.append(level_changes)
@@ -227,9 +221,7 @@ def fill_missing(
     return filled
 
 
-def _off_path(
-    time: np.ndarray, position: np.ndarray, tolerance: float, max_acceleration: float, longest_run: float
-) -> tuple[np.ndarray, int]:
+def _off_path(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, int]:
     """Rows off the longest smooth path of one marker, and the number of breaks in that path.
 
     A path with only smooth steps needs no search; the search covers the other steps only.
@@ -238,8 +230,8 @@ def _off_path(
     if len(time) < 4 * _VELOCITY_ROWS:
         return wrong, breaks
     interval = float(np.median(np.diff(time)))
-    reach = int(np.clip(round(longest_run / interval), 2, MOST_ROWS))
-    motion = _Motion(time, position, *_end_velocities(time, position), interval, tolerance, max_acceleration)
+    reach = int(np.clip(round(LONGEST_RUN / interval), 2, MOST_ROWS))
+    motion = _Motion(time, position, *_end_velocities(time, position), interval)
     rough = np.flatnonzero(~motion.smooth(1)) + 1
     for part in _around(rough, _MARGIN * reach, len(time)):
         wrong[part], broken = _longest_path(motion.part(part), reach)
@@ -261,8 +253,6 @@ class _Motion(NamedTuple):
     arriving: np.ndarray
     leaving: np.ndarray
     interval: float
-    tolerance: float
-    max_acceleration: float
 
     def part(self, rows: slice) -> _Motion:
         """Some rows of it."""
@@ -278,7 +268,7 @@ class _Motion(NamedTuple):
         gap = (self.time[last] - self.time[first])[:, None]
         step = self.position[last] - self.position[first]
         before, after = self.arriving[first], self.leaving[last]
-        allowed = self.tolerance + self.max_acceleration * self.interval**2
+        allowed = TOLERANCE + MAX_ACCELERATION * self.interval**2
         allowed = allowed * (1.0 + _DRIFT_PER_ROW * (gap[:, 0] / self.interval - 1.0).clip(0.0))
         agrees = np.linalg.norm(step - gap * 0.5 * (before + after), axis=1) <= allowed
         if apart <= _ONSET_ROWS:

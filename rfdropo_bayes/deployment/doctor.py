@@ -18,17 +18,16 @@ from rfdropo_bayes.deployment.clock import measure_jitter
 from rfdropo_bayes.errors import InputError
 
 PACKAGES = ("canopen", "python-can", "onnxruntime", "natnet", "numpy")
-IDLE_RUNS = 5
+IDLE_RUNS, IDLE_SECONDS = 5, 2.0
 _IDENTITY = ((1, "vendor"), (2, "product"), (3, "revision"), (4, "serial"))
 
 
-def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 2.0) -> dict[str, Any]:
+def examine(bus: BusTable | None, rate_hz: float = 100.0) -> dict[str, Any]:
     """Measure and ask; nothing is written to any drive.
 
     Args:
         bus: bus to search for drives; None skips the search.
         rate_hz: rate of the loop whose jitter is measured.
-        seconds: length of each idle run.
 
     Returns:
         Versions, processors and load, the median of the idle runs' lateness [s], and the drives found; "problems" lists
@@ -39,7 +38,7 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0, seconds: float = 2.0) 
     problems += [
         f"{name} is not installed: pip install 'rfdropo_bayes[deploy]'" for name, v in versions.items() if not v
     ]
-    runs = [measure_jitter(1.0 / rate_hz, seconds) for _ in range(IDLE_RUNS)]
+    runs = [measure_jitter(1.0 / rate_hz, IDLE_SECONDS) for _ in range(IDLE_RUNS)]
     jitter = {
         "rate_hz": rate_hz,
         "real_time": runs[0].fifo,

@@ -109,7 +109,6 @@ def record(
         "next_experiment": next_experiment,
         "rollouts": answer.cost.rollouts,
         "seconds": round(answer.cost.seconds, 2),
-        "waited_seconds": round(answer.cost.waited, 2),
         "profile": {stage: round(seconds, 2) for stage, seconds in answer.cost.profile.items()},
         "minutes": answer.problem.rules.minutes,
         "seed": answer.problem.seed,

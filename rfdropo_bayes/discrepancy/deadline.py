@@ -5,58 +5,17 @@ present results.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import NoReturn
 
 from rfdropo_bayes.interrupts import answer_interrupt, interrupted
-from rfdropo_bayes.runtime import available_processors
-
-THREADS = Path("/proc/self/task")
-NANOSECOND = 1e-9
-
-Times = Mapping[str, tuple[float, float]]
 
 KEPT = 0.15  # share of the time that is kept for measuring the gain and for the report
 PATIENCE = 20.0  # seconds that the same may take after Ctrl-C
 TIME, INTERRUPT = "time", "interrupt"
 BETWEEN_STAGES = "preparation and report"
-
-
-def thread_times() -> dict[str, tuple[float, float]]:
-    """Seconds that each thread of this process has run, and seconds that it was ready but waiting.
-
-    Empty if the system does not count them, as only Linux does.
-    """
-    times = {}
-    with suppress(OSError):
-        for thread in THREADS.iterdir():
-            with suppress(OSError, ValueError):  # a thread that has ended meanwhile
-                ran, waited, _ = map(int, (thread / "schedstat").read_text().split())
-                times[thread.name] = (NANOSECOND * ran, NANOSECOND * waited)
-    return times
-
-
-def delay(elapsed: float, before: Times, after: Times, processors: int) -> float:
-    """Seconds by which the work of all threads took longer than with the processors for itself alone.
-
-    Simultaneously ready threads share the processors. Time without a ready thread, as while another process simulates,
-    is no delay.
-
-    Args:
-        elapsed: seconds between the two measurements.
-        before, after: times of the threads, see `thread_times`; ended threads are unknown.
-        processors: number of processors.
-    """
-    ran, ready = 0.0, 0.0
-    for name, (running, waiting) in after.items():
-        earlier = before.get(name, (0.0, 0.0))
-        ran += running - earlier[0]
-        ready += running - earlier[0] + waiting - earlier[1]
-    side_by_side = min(max(ready / elapsed, 1.0), processors) if elapsed > 0.0 else 1.0
-    return max(min(elapsed, ready) - ran / side_by_side, 0.0)
 
 
 class OutOfTime(Exception):
@@ -73,7 +32,6 @@ class Deadline:
         share: share of the time after which rollouts stop.
         reached: whether anything was left undone.
         why: its reason, "time" or "interrupt".
-        waited: seconds of waiting for processors used by other programs, see `delay`.
     """
 
     minutes: float = float("inf")
@@ -82,11 +40,9 @@ class Deadline:
     began: float = field(default_factory=time.monotonic)
     reached: bool = False
     why: str = ""
-    waited: float = 0.0
     _spent: dict[str, float] = field(default_factory=dict)
     _stages: list[str] = field(default_factory=lambda: [BETWEEN_STAGES])
     _charged: float = field(default_factory=time.monotonic)
-    _threads: dict[str, tuple[float, float]] = field(default_factory=thread_times)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -110,10 +66,9 @@ class Deadline:
         return dict(self._spent)
 
     def _charge(self) -> None:
-        now, threads = time.monotonic(), thread_times()
+        now = time.monotonic()
         self.recall(now - self._charged)
-        self.waited += delay(now - self._charged, self._threads, threads, available_processors())
-        self._charged, self._threads = now, threads
+        self._charged = now
 
     @property
     def remaining(self) -> float:

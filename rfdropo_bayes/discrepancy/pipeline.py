@@ -132,14 +132,12 @@ class Cost:
         unfinished: unfinished parts.
         rollouts: rollouts of the whole run.
         profile: seconds of each stage, summed over all parts of a resumed audit.
-        waited: seconds of waiting of its last part for processors used by other programs.
     """
 
     stopped: str
     unfinished: tuple[str, ...]
     rollouts: int
     profile: dict[str, float]
-    waited: float
 
     @property
     def seconds(self) -> float:
@@ -370,7 +368,7 @@ def conclude(results: Results, report: Callable[[str], None] = lambda line: None
         shift=target.measurements.shift,
         numerical=shown,
         priors=decided_by_priors(target, draws),
-        cost=Cost(why, unfinished, rollouts, clock.profile, clock.waited),
+        cost=Cost(why, unfinished, rollouts, clock.profile),
     )
 
 

@@ -69,11 +69,10 @@ def _stopped(answer: Answer) -> str:
     not_done = f" Not done: {'; '.join(map(spoken, cost.unfinished))}." if cost.unfinished else ""
     if cost.stopped == INTERRUPT:
         return f" The audit was stopped after {cost.seconds:.0f} s: these are its results so far.{not_done}"
-    minutes, waited = answer.problem.rules.minutes, round(cost.waited / 60.0)
-    busy = f" For {waited} of these minutes the audit waited for processors that other programs held." if waited else ""
+    minutes = answer.problem.rules.minutes
     return (
         f" The time was up after {minutes:g} minutes ([audit] minutes), before every question was asked: raise it and "
-        f"go on with --resume.{not_done}{busy}"
+        f"go on with --resume.{not_done}"
     )
 
 

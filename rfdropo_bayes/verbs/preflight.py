@@ -162,15 +162,12 @@ class _Noise(NamedTuple):
     words: str
 
 
-def preflight(
-    model: Model, runs: Sequence[Trajectory], *, method: str = "", rollouts: int = 0, seed: int = 0, share: float = 1.0
-) -> Preflight:
+def preflight(model: Model, runs: Sequence[Trajectory], *, seed: int = 0, share: float = 1.0) -> Preflight:
     """Estimate within seconds the combinations that a fit of these recordings can determine.
 
     Args:
         model: model to fit.
         runs: recordings to fit.
-        method: and ``rollouts``: its budget; by default from the model's experiment.
         seed: seed of the prior draws.
         share: number of rows in ``runs`` divided by the number in the fit.
 
@@ -205,8 +202,8 @@ def preflight(
         known = known + _information(tension)
     more = _further(model, coordinates, tension)
     settings = model.settings.inference
-    budget, stated = rollouts or settings.rollouts or ROLLOUTS, None
-    if not (rollouts or settings.rollouts) and settings.minutes is not None:
+    budget, stated = settings.rollouts or ROLLOUTS, None
+    if not settings.rollouts and settings.minutes is not None:
         budget, stated = budget_within(settings.minutes, per_set, 1.0).rollouts, settings.minutes
     return Preflight(
         _directions(coordinates, known, more),
@@ -218,7 +215,7 @@ def preflight(
         per_set,
         budget,
         budget * per_set / 60.0 if stated is None else stated,
-        method or settings.method,
+        settings.method,
         clock.perf_counter() - begun,
     )
 

@@ -63,7 +63,7 @@ def found(truth: dict, seed: int, without: tuple[str, ...] = (), audited=audited
 
 def untimed(content: dict) -> dict:
     """What is the same in each run of an audit."""
-    return {key: value for key, value in content.items() if key not in ("seconds", "profile", "waited_seconds")}
+    return {key: value for key, value in content.items() if key not in ("seconds", "profile")}
 
 
 def test_a_lone_effect_is_explained_with_its_size():

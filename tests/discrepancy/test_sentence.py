@@ -103,9 +103,3 @@ def test_a_prior_that_leaves_the_truth_out_is_said_beside_what_is_found(high, de
     assert bool(about) == decides
     assert ("bend sits on the lower end -0.2 of its prior" in content["sentence"]) == decides
     assert all(row["sentence"] in content["sentence"] for row in about)
-
-
-def test_an_audit_that_others_kept_from_computing_says_so(answer):
-    stopped = replace(answer, cost=replace(answer.cost, stopped=True, waited=620.0))
-    assert "For 10 of these minutes the audit waited for processors that other programs held." in said(stopped)
-    assert "waited" not in said(replace(stopped, cost=replace(stopped.cost, waited=20.0)))

@@ -12,7 +12,15 @@ from typer.testing import CliRunner
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.cli.main import app
-from rfdropo_bayes.verbs.preflight import _Coordinates, _covariance, _directions, _Noise, innovations, preflight
+from rfdropo_bayes.verbs.preflight import (
+    ROLLOUTS,
+    _Coordinates,
+    _covariance,
+    _directions,
+    _Noise,
+    innovations,
+    preflight,
+)
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 STEP = 0.02
@@ -158,9 +166,9 @@ def test_parameters_that_need_a_measurement_of_their_own_share_a_sentence():
 
 
 def test_the_cost_is_that_of_the_budget():
-    found = preflight(model(), [recording()], method="laplace", rollouts=600)
-    assert found.minutes == pytest.approx(600 * found.rollout_seconds / 60.0)
-    assert "laplace: 600 rollouts" in str(found)
+    found = preflight(model(), [recording()])
+    assert found.minutes == pytest.approx(ROLLOUTS * found.rollout_seconds / 60.0)
+    assert f"smc: {ROLLOUTS} rollouts" in str(found)
     json.dumps(found.as_dict())
     assert "common scale" in found._repr_html_()
 
