@@ -52,7 +52,7 @@ FROM_PRIOR = "smc_from_prior"
 
 @dataclass(frozen=True, repr=False)
 class SmcConfig(MethodOptions, called="SMC"):
-    """Horizon SMC: posterior and evidence of every block of rows, by sampling from growing prefixes.
+    """Horizon SMC: posterior and evidence, by sampling from growing prefixes.
 
     Attributes:
         rollouts: budget in full-length rollouts, of all replicates together; None for no limit.

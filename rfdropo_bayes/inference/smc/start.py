@@ -3,8 +3,8 @@
 From a prior that is thousands of times wider than the posterior the path takes dozens of stages. An exhausted budget
 then ends in a leap that leaves a few particles alive. Some fifty rollouts predict the number of stages, from the
 likelihood's information at the best of some prior draws (`way_from_prior`). If the stages cost too much, optimisations
-find the optima, and the sampler starts around them (`bridge`). The evidence of the blocks of rows, a by-product of a
-start at the prior, then comes from importance sampling around the optima of the prefixes.
+find the optima, and the sampler starts around them (`bridge`). The evidence of the blocks of rows is a by-product of a
+start at the prior alone.
 
 **The length of the path.** A sampler that keeps a share e of effective particles between targets takes steps of length
 sqrt(ln 1/e) in the metric Var(log weight). In coordinates whitened by the prior, direction j has the information
@@ -20,25 +20,23 @@ evenly along the data, b is also the prefix that a stage needs, which sets its c
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from scipy.special import logsumexp
 
 from rfdropo_bayes.bayes.problem import Problem, ResidualProblem, WarmStart
 from rfdropo_bayes.errors import InputError, NoLikelihoodError
-from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries, evaluate_prior, evaluate_rows
+from rfdropo_bayes.inference.evaluations import Ledger, block_boundaries
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, Modes, find_modes, starts_of_draws
-from rfdropo_bayes.inference.modes.optimisation import Laplace, laplace, maximise
+from rfdropo_bayes.inference.modes.optimisation import Laplace
 from rfdropo_bayes.inference.modes.targets import make_target, prior_derivatives
 from rfdropo_bayes.inference.progress import UNRECORDED, Logbook, run_digest
 from rfdropo_bayes.inference.result import InferenceResult
 from rfdropo_bayes.inference.smc import bridge, sampler
-from rfdropo_bayes.inference.smc.bridge import ModeMixture
 from rfdropo_bayes.inference.smc.sampler import FEWEST_PARTICLES, MOST_REPLICATES, WORTH_A_REPLICATE, SmcConfig
-from rfdropo_bayes.inference.smc.tempering import EFFECTIVE, log_effective_sample_size
+from rfdropo_bayes.inference.smc.tempering import EFFECTIVE
 
 FROM_OPTIMA = "smc_from_optima"
 OPTIMISING = 0.25  # share of the budget for optimisations
@@ -50,15 +48,11 @@ PILOT_STEPS = 7.0  # typical cost of an optimisation after a pilot run, in rollo
 CLOSE = 1e-2  # nats below its optimum at which an optimisation may end: the sampler starts from a wider distribution
 STEPS = 12.0  # typical steps of an optimisation at each horizon
 OPTIMISED = 0.6  # share of the work that is done after the optimisations, for a progress bar
-SCORING = 0.1  # share of the budget for the evidence of the blocks
 PRIOR_DRAWS = 64  # prior draws; the likelihood's information is taken at the best
 MARGIN = 3.0  # cost of real posteriors over the estimate, which assumes normality and even data
 ENOUGH = 200  # particles per replicate that a start at the prior must allow
 MOVES = 4.0  # of a stage: about 3 if the posterior is normal, otherwise more
 FARTHEST = 5.0  # prior deviations of a value at most; farther values mean a conflict of prior and data
-INFLATION, DEGREES, PRIOR_SHARE = 1.3, 5.0, 0.2  # the posterior of a short prefix is near the prior
-MOST_STEPS = 12  # of the optimisation from the optimum of all rows to the optimum of a prefix
-MOST_DRAWS, FEWEST_DRAWS = 400, 30
 
 
 def run(problem: Problem, config: SmcConfig, key: PRNGKeyArray, logbook: Logbook = UNRECORDED) -> InferenceResult:
@@ -156,45 +150,11 @@ def _with_cost(result: InferenceResult, ledger: Ledger) -> InferenceResult:
 def _from_optima(
     problem: ResidualProblem, config: SmcConfig, optima: Modes, way: Way | None, key: PRNGKeyArray, logbook: Logbook
 ) -> InferenceResult:
-    sample_key, score_key = jax.random.split(key)
-    remaining = _remaining(config, optima.search.ledger)
-    prefixed = len(block_boundaries(problem.n_rows, config.blocks)) > 1
-    scoring = None if remaining is None else SCORING * prefixed * config.rollouts  # type: ignore[operator]
-    sampling = None if remaining is None else remaining - scoring  # type: ignore[operator]
-    once = replace(config, rollouts=sampling, blocks=1)
+    once = replace(config, rollouts=_remaining(config, optima.search.ledger), blocks=1)
     settings = replace(once, replicates=sampler.decided(1, once).chains)
-    result = bridge.sample_from_modes(problem, settings, optima, sample_key, logbook)
-    prefixes, ledger = _prefixes(problem, config, optima, scoring, score_key)
-    value, sd = result.log_evidence or (np.nan, np.nan)
-    whole = PrefixEvidence(problem.n_rows, value, 0.0 if np.isnan(sd) else sd, 1.0)
-    every = np.full(problem.n_rows, np.nan)
-    for prefix in (*prefixes, whole):
-        every[prefix.horizon - 1] = prefix.value
-    return replace(
-        result,
-        method="smc",
-        prefix_log_evidence=every,
-        block_scores=block_scores([*prefixes, whole]),
-        **(result.spent + ledger).record(),
-        details=result.details
-        | {
-            "algorithm": FROM_OPTIMA,
-            **({} if way is None else {"expected_stages": way.stages, "information_nats": way.information}),
-            "prefix_ess": [prefix.ess for prefix in prefixes],
-        },
-    )
-
-
-def _prefixes(
-    problem: ResidualProblem, config: SmcConfig, optima: Modes, scoring: float | None, key: PRNGKeyArray
-) -> tuple[list[PrefixEvidence], Ledger]:
-    """Evidence at the ends of all blocks but the last, whose evidence is the sampler's."""
-    ledger = Ledger()
-    horizons = block_boundaries(problem.n_rows, config.blocks)[:-1]
-    assert optima.search.noise is not None
-    if not horizons:
-        return [], ledger
-    return prefix_evidence(problem, optima.modes[0], optima.search.noise, horizons, scoring, key, ledger), ledger
+    result = bridge.sample_from_modes(problem, settings, optima, key, logbook)
+    told = {} if way is None else {"expected_stages": way.stages, "information_nats": way.information}
+    return replace(result, method="smc", details={**result.details, "algorithm": FROM_OPTIMA, **told})
 
 
 class Way(NamedTuple):
@@ -258,82 +218,3 @@ def _whitened(
     moved = vectors.T @ (inverse @ (mode.mean - mean))
     offset = np.where(information > 0.1, moved * (1.0 + information) / np.maximum(information, 0.1), 0.0)
     return information, np.clip(offset, -FARTHEST, FARTHEST)
-
-
-class PrefixEvidence(NamedTuple):
-    """Log evidence of a prefix, its Monte-Carlo deviation, and the share of effective draws behind it."""
-
-    horizon: int
-    value: float
-    sd: float
-    ess: float
-
-
-def prefix_evidence(
-    problem: ResidualProblem,
-    mode: Laplace,
-    noise: np.ndarray,
-    horizons: tuple[int, ...],
-    budget: float | None,
-    key: PRNGKeyArray,
-    ledger: Ledger,
-) -> list[PrefixEvidence]:
-    """Evidence of the prefixes ``horizons``, computed from the longest, returned from the shortest.
-
-    Args:
-        problem: problem with residuals.
-        mode: mode for all rows, the start of the optimisations for the prefixes.
-        noise: noise coordinates.
-        horizons: prefix lengths.
-        budget: full-length rollouts, half for optimisations and half for draws; None for no limit.
-        key: random key.
-        ledger: charged with the cost.
-
-    Returns:
-        the evidences; empty if the budget is too small.
-    """
-    steps, draws = _affordable_scores(problem, noise, horizons, budget)
-    if steps < 1 or draws < FEWEST_DRAWS:
-        return []
-    prior, start, estimates = prior_derivatives(problem), mode.mean, []
-    for horizon in sorted(horizons, reverse=True):
-        target = make_target(problem, horizon, ledger, start, prior, noise)
-        state, _ = maximise(target, start, max_steps=steps, tolerance=1e-2)
-        start = state.position
-        mixture = ModeMixture(problem, [laplace(target, state)], INFLATION, DEGREES, PRIOR_SHARE)
-        u = mixture.sample(jax.random.fold_in(key, horizon), draws)
-        density = evaluate_prior(problem, u) + evaluate_rows(problem, u, horizon, ledger).sum(axis=1)
-        estimates.append(_estimate(horizon, density - mixture.log_density(u)))
-    return estimates[::-1]
-
-
-def _affordable_scores(
-    problem: ResidualProblem, noise: np.ndarray, horizons: tuple[int, ...], budget: float | None
-) -> tuple[int, int]:
-    """Steps of each optimisation, and draws for each prefix."""
-    if budget is None or not horizons:
-        return MOST_STEPS, MOST_DRAWS
-    share = 0.5 * budget * problem.n_rows / sum(horizons)  # rollouts of a prefix, for optimisation and draws each
-    d, k = len(noise), int(noise.sum())
-    step = 4.0 * d + 7.0  # a Jacobian by differences, noise coordinates, six dampings
-    around = 3.0 * step + 8.0 * k**2  # the normal approximation at the end, twice: the second along its own axes
-    return min(MOST_STEPS, int((share - around) / step)), min(MOST_DRAWS, int(share))
-
-
-def _estimate(horizon: int, log_weights: Float[np.ndarray, " n"]) -> PrefixEvidence:
-    n = len(log_weights)
-    value = float(logsumexp(log_weights) - np.log(n))
-    if not np.isfinite(value):
-        return PrefixEvidence(horizon, -np.inf, float("nan"), 0.0)
-    share = float(np.exp(log_effective_sample_size(log_weights))) / n
-    return PrefixEvidence(horizon, value, float(np.sqrt(max(1.0 / share - 1.0, 0.0) / n)), share)
-
-
-def block_scores(prefixes: list[PrefixEvidence]) -> list[dict[str, Any]]:
-    """Scores of the blocks between consecutive prefixes, as samplers that pass them report them."""
-    scores, before = [], PrefixEvidence(0, 0.0, 0.0, 1.0)
-    for now in prefixes:
-        score, sd = now.value - before.value, float(np.hypot(now.sd, before.sd))
-        scores.append({"first_row": before.horizon + 1, "last_row": now.horizon, "log_score": score, "sd": sd})
-        before = now
-    return scores
