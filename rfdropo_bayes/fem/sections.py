@@ -1,7 +1,12 @@
 """Response of a rod's sections to strains: linear, or by the laws of ``effects``.
 
-The bending law is a symmetric matrix of bending and twist. The fibre law gives every fibre of the section the energy E
-(x^2 - c x^3) / 2 of its strain x: the section's is E A (e^2 - c e^3) / 2 and (1 - 3 c e) times the bending energy.
+The bending law is a symmetric matrix of bending and twist. The fibre law gives every fibre of the section the tangent
+stiffness E s of its strain x,
+
+    s = (r - h)^2,  r = sqrt(1 + h^2),  h = 3 c x / 2,
+
+which is 1 - 3 c x to first order and positive at any strain: a polynomial has a strain beyond which the body collapses.
+The section's stress in stretch is E A times the integral of s, its bending energy the linear one times s.
 """
 
 from __future__ import annotations
@@ -15,9 +20,6 @@ from jaxtyping import Array, Float
 from rfdropo_bayes.fem.components import diagonal, dot, times
 from rfdropo_bayes.fem.effects import BendingLaw, BodyEffects, Scalar
 from rfdropo_bayes.fem.rod import SHEAR, Rod, shear_ratios
-
-LEAST_TANGENT = 0.1
-"""Least tangent stiffness under the fibre law, relative to the linear section's: matrices stay positive definite."""
 
 
 class Inner(NamedTuple):
@@ -81,15 +83,32 @@ def linear(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "6 
     return jnp.concatenate([section.stretch * strain[:3], moment])
 
 
+class Fibres(NamedTuple):
+    """The fibre law at the stretch of a section."""
+
+    tangent: Float[Array, "..."]  # s, relative to the linear section's
+    secant: Float[Array, "..."]  # stress in stretch, relative to the linear section's
+    change: Float[Array, "..."]  # derivative of s by the stretch
+
+
+def fibres(c: Scalar, stretch: Float[Array, "..."]) -> Fibres:
+    """The fibre law at a stretch."""
+    h = 1.5 * c * stretch
+    r = jnp.sqrt(1.0 + h**2)
+    tangent = (r - h) ** 2
+    secant = 1.0 + 2.0 / 3.0 * h * (h - (r**2 + r + 1.0) / (r + 1.0))
+    return Fibres(tangent, secant, -3.0 * c * tangent / r)
+
+
 def answer(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "6 ..."]:
     """Forces [N] and moments [N m] of the sections."""
     result = linear(section, strain)
     if section.fibre is None:
         return result
-    stretch, moment = strain[2], times(section.bending[:2, :2], strain[3:5])
-    pull = 1.5 * section.fibre * (section.stretch[2] * stretch**2 + dot(moment, strain[3:5]))
-    softer = 3.0 * section.fibre * stretch * moment
-    return result - jnp.concatenate([jnp.zeros_like(result[:2]), pull[None], softer, jnp.zeros_like(result[:1])])
+    law, moment = fibres(section.fibre, strain[2]), times(section.bending[:2, :2], strain[3:5])
+    pull = section.stretch[2] * strain[2] * (law.secant - 1.0) + 0.5 * law.change * dot(moment, strain[3:5])
+    none = jnp.zeros_like(result[:1])
+    return result + jnp.concatenate([none, none, pull[None], (law.tangent - 1.0) * moment, none])
 
 
 def energy(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "..."]:
@@ -98,17 +117,23 @@ def energy(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "..
     if section.fibre is None:
         return result
     stretch, moment = strain[2], times(section.bending[:2, :2], strain[3:5])
-    return result - 0.5 * section.fibre * stretch * (section.stretch[2] * stretch**2 + 3.0 * dot(moment, strain[3:5]))
+    h = 1.5 * section.fibre * stretch
+    small = jnp.abs(h) < 1e-3
+    x = jnp.where(small, 1.0, h)
+    cubed = x * (2.0 * x**2 + 5.0) * jnp.sqrt(1.0 + x**2) / 8.0 + 0.375 * jnp.arcsinh(x)  # integral of r^3
+    share = 0.5 + x**2 / 6.0 - 2.0 / 3.0 * (cubed - x) / x**2
+    share = jnp.where(small, 0.5 - h / 3.0 + h**2 / 6.0, share)
+    bent = 0.5 * (fibres(section.fibre, stretch).tangent - 1.0) * dot(moment, strain[3:5])
+    return result + section.stretch[2] * stretch**2 * (share - 0.5) + bent
 
 
 def slopes(section: Sections, strain: Float[Array, "6 ..."]) -> Sections:
     """Tangent stiffness of the sections. It neglects the coupling of stretch and bending."""
     if section.fibre is None:
         return section
-    tangent = jnp.maximum(1.0 - 3.0 * section.fibre * strain[2], LEAST_TANGENT)
-    axial = np.array([0.0, 0.0, 1.0]).reshape(3, *[1] * tangent.ndim)
-    planar = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]).reshape(3, 3, *[1] * tangent.ndim)
-    softer = tangent - 1.0
+    softer = fibres(section.fibre, strain[2]).tangent - 1.0
+    axial = np.array([0.0, 0.0, 1.0]).reshape(3, *[1] * softer.ndim)
+    planar = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]).reshape(3, 3, *[1] * softer.ndim)
     return section._replace(
         stretch=section.stretch * (1.0 + axial * softer), bending=section.bending * (1.0 + planar * softer)
     )

@@ -217,10 +217,8 @@ class ViscoelasticBranch:
 
 
 class FibreLaw:
-    """The stiffness of the body's fibres changes with their strain: stress E (x - 3 c x^2 / 2); zero is the base
-    simulator.
-
-    A section then has the energy E A / 2 (e^2 - c e^3) + E I / 2 k^2 (1 - 3 c e) of its stretch e and curvature k.
+    """The stiffness of the body's fibres changes with their strain, by 1 - 3 c x at small strains x and never below
+    zero; zero is the base simulator. See `fem.sections`.
     """
 
     name = "fibre_law"
@@ -236,7 +234,7 @@ class FibreLaw:
             2.0,
             0.0,
             normal(0.5),
-            "c of the fibre energy E/2 (x^2 - c x^3): -1 St. Venant-Kirchhoff, 2/3 rubber, positive softer in tension",
+            "c of the stiffness E (1 - 3 c x) at small strains x: -1 St. Venant-Kirchhoff, 2/3 rubber",
         ),
     )
 

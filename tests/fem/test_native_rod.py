@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
 from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
@@ -170,10 +171,12 @@ def test_coupled_bending_twists_the_tip():
     assert (found[1] - found[0])[1] / HALF == pytest.approx(turn[2], rel=1e-3)
 
 
-def test_fibres_stiffen_or_soften_with_stretch():
-    """Pulled along its axis a bar answers E A (e - 3 c e^2 / 2)."""
-    area, stretch, c = 4.0 * HALF**2, 0.03, -1.0
-    force = YOUNG * area * (stretch - 1.5 * c * stretch**2)
+@pytest.mark.parametrize(("c", "stretch"), [(-1.0, 0.03), (0.7, 0.2), (1.5, 0.35)])
+def test_fibres_stiffen_or_soften_with_stretch(c, stretch):
+    """Pulled along its axis a bar answers E A times the integral of (r - h)^2, h = 3 c x / 2, r^2 = 1 + h^2. At the last
+    stretch the polynomial 1 - 3 c x is below zero."""
+    area = 4.0 * HALF**2
+    force = YOUNG * area * quad(lambda x: (np.hypot(1.0, 1.5 * c * x) - 1.5 * c * x) ** 2, 0.0, stretch)[0]
     law = fem.BodyEffects(bending=fem.BendingLaw(c))
     rest = NativeRod(*bar(), TIME_STEP, threads=1, integrator="quasi-static")
     found = rest.rollout(bar_material(effects=law), np.zeros((1, 1, 0)), loads=pushed(np.array([0.0, 0.0, force]), 2))

@@ -11,7 +11,6 @@ from rfdropo_bayes.fem.native.rod_records import FIRM, RATE, SLOPE, STRAIN, STRE
 from rfdropo_bayes.fem.native.rod_tables import FRAME, SECTION, SIZE
 from rfdropo_bayes.fem.native.simd import fill, fma, fnma, kernel, load, load3, square_root, store, where_greater
 from rfdropo_bayes.fem.native.vectors import add_to, added, dot, minus, put, scaled
-from rfdropo_bayes.fem.sections import LEAST_TANGENT
 from rfdropo_bayes.fem.surroundings import STILL, WALL_SOFTNESS
 
 BENDING, BRANCH, SURROUNDED, FRICTION = range(4)
@@ -33,8 +32,7 @@ def find_slopes(tables, samples, element, work, token):
     """The section's tangent and its stiffness with the laws of its bending and of its fibres, into ``SLOPE`` and
     ``FIRM``."""
     rows, section, law = work.element, SECTION * element, LAW * element
-    left, least = _left(tables, samples, element, work, token), fill(LEAST_TANGENT, work.element, token)
-    left = where_greater(left, least, left, least)
+    left = _fibres(tables, samples, element, work, token)[0]
     store(rows, SLOPE + 2, left * load(samples.section, section + 2, token))
     for i in range(LAW):
         firm = load(samples.law, law + i, token)
@@ -46,10 +44,15 @@ def find_slopes(tables, samples, element, work, token):
 
 
 @kernel
-def _left(tables, samples, element, work, token):
-    """Remaining share of the bending stiffness under stretch, by the law of fibres."""
-    steep = load(samples.effects, FIBRE, token) * (3.0 / tables.length[element])
-    return fnma(steep, load(work.element, STRAIN + 2, token), fill(1.0, work.element, token))
+def _fibres(tables, samples, element, work, token):
+    """Tangent and secant of the law of fibres, and half the derivative of the tangent by the stretch of the element."""
+    steep, one = load(samples.effects, FIBRE, token) * (1.5 / tables.length[element]), fill(1.0, work.element, token)
+    h = steep * load(work.element, STRAIN + 2, token)
+    square = fma(h, h, one)
+    r = square_root(square)
+    tangent = (r - h) * (r - h)
+    secant = fma(h * (2.0 / 3.0), h - (square + r + one) / (r + one), one)
+    return tangent, secant, -(steep * tangent) / r
 
 
 @kernel
@@ -63,16 +66,16 @@ def _moments(rows, first, a, token):
 @kernel
 def place_law_stress(tables, samples, element, force, rate, work, token):
     """Stresses of stretch, bending and twist by the laws of the section."""
-    rows, half = work.element, 0.5 * load(samples.effects, FIBRE, token) * (3.0 / tables.length[element])
+    rows = work.element
+    tangent, secant, change = _fibres(tables, samples, element, work, token)
     stretch, stiff = load(rows, STRAIN + 2, token), load(samples.section, SECTION * element + 2, token)
     bend, turning = load3(rows, STRAIN + 3, token), load3(rows, RATE + 3, token)
     moment, slow = _moments(rows, FIRM, bend, token), _moments(rows, SLOPE + 3, turning, token)
     cross = load(rows, FIRM + 2, token) * bend[2], load(rows, FIRM + 4, token) * bend[2]
     planar = moment[0] - cross[0], moment[1] - cross[1]
-    pull = fma(stiff * stretch, stretch, fma(planar[0], bend[0], planar[1] * bend[1]))
-    pull = force * fnma(half, pull, stiff * stretch)
+    pull = force * fma(stiff * stretch, secant, change * fma(planar[0], bend[0], planar[1] * bend[1]))
     store(rows, STRESS + 2, fma(rate * load(rows, SLOPE + 2, token), load(rows, RATE + 2, token), pull))
-    softer = 2.0 * half * stretch
+    softer = fill(1.0, rows, token) - tangent
     bent = fnma(softer, planar[0], moment[0]), fnma(softer, planar[1], moment[1]), moment[2]
     put(rows, STRESS + 3, added(bent, force, scaled(slow, rate)))
 
