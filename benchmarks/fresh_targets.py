@@ -27,9 +27,11 @@ from studies.table2 import ORACLE, OURS, ROWS, Table2Size, run_table2, share_of
 
 MINUTES = 300.0
 """Of an audit, by the clock on the wall: a study shares its machine, and what an audit says must not depend on that."""
-SIZES = {  # by scene, but for a target in MuJoCo; with 200,000 steps policies that reach are not learnt to the end
+# By scene, but for a target in MuJoCo. Too few steps measure learning, not transfer: 200,000 were for targets of scene
+# reach, 600,000 for the arm in MuJoCo, where 2 million brought 95 instead of 72 % of the goals within 10 mm.
+SIZES = {
     "reach": Table2Size(seeds=1, steps=200_000, episodes=200, budget=3_000, minutes=MINUTES, exact_oracle=True),
-    "mujoco": Table2Size(seeds=1, steps=600_000, episodes=200, budget=3_000, minutes=MINUTES, exact_oracle=True),
+    "mujoco": Table2Size(seeds=1, steps=1_000_000, episodes=200, budget=3_000, minutes=MINUTES, exact_oracle=True),
     "push": Table2Size(seeds=1, steps=600_000, episodes=200, budget=2_000, minutes=MINUTES, exact_oracle=True),
 }
 LEADING, RIVALS = (ORACLE, OURS, "ours", "no randomisation"), ("UDR", "RF-DROPO as published", "BayesSim", "NPDR")
