@@ -52,7 +52,7 @@ def examine(bus: BusTable | None, rate_hz: float = 100.0) -> dict[str, Any]:
         problems.append("no real-time scheduling: allow SCHED_FIFO (ulimit -r 60, or CAP_SYS_NICE)")
     if jitter["missed"]:
         problems.append(
-            f"an idle loop misses {jitter['missed']} deadlines in {seconds:g} s: free this machine of other work"
+            f"an idle loop misses {jitter['missed']} deadlines in {IDLE_SECONDS:g} s: free this machine of other work"
         )
     drives: dict[str, Any] = {}
     if bus is not None:

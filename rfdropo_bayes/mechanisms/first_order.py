@@ -11,7 +11,7 @@ def first_order(
     before: Float[Array, "*shape"],
     given: Float[Array, "*shape"],
     gap: float | Float[Array, ""],
-    time_constant: Float[Array, "*shape"] | Float[Array, ""],
+    time_constant: float | Float[Array, "*shape"] | Float[Array, ""],
 ) -> Float[Array, "*shape"]:
     """``y`` of ``tau y' = u - y`` at the end of a gap in which u runs straight from ``before`` to ``given``; exact.
 
