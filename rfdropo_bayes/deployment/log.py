@@ -71,13 +71,12 @@ class SessionLog:
         folder: folder to write to, without a session.
         robot: robot to drive.
         facts: facts about the session, kept in the recording's settings.
-        frames: name of the file of CAN frames; its ending chooses the format.
 
     Raises:
         InputError: if the folder holds a session, or cannot be written to.
     """
 
-    def __init__(self, folder: Path, robot: Robot, facts: Mapping[str, Any], frames: str = FRAMES) -> None:
+    def __init__(self, folder: Path, robot: Robot, facts: Mapping[str, Any]) -> None:
         self.folder = Path(folder)
         if (self.folder / JOURNAL).exists():
             raise InputError("holds a session already", where=str(folder), remedy="give another folder with --out")
@@ -104,7 +103,7 @@ class SessionLog:
         except OSError as error:
             raise unwritten(error, self.folder) from None
         self.record = np.zeros((), record_type(len(robot.channel_names), len(robot.marker_names)))
-        self.frames = FrameLog(self.folder / frames)
+        self.frames = FrameLog(self.folder / FRAMES)
         self._records: deque[bytes] = deque()
         self._lines: deque[str] = deque()
         self._closed, self._writing = threading.Event(), threading.Lock()

@@ -140,7 +140,7 @@ class _Session:
         settings.drives.check_serial(robot.channel_names)
         self._load_policy()
         self.offsets = self._offsets()
-        self.log = SessionLog(out, robot, self._facts, settings.frames)
+        self.log = SessionLog(out, robot, self._facts)
         stack.callback(self.log.close)
         if "warning" in self._facts:
             self.log.event("warning", self._facts["warning"])

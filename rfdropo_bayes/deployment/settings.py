@@ -163,7 +163,6 @@ class Deployment(_Table):
         robot: name or file of a robot with motors.
         rate_hz: rate of the set-point loop.
         duration_s: duration of the policy.
-        frames: file of CAN frames in the session's folder; .log is candump, .blf binary.
         goal: x, y and z of the policy's goal [m].
         bus, drives, policy, sensor, safety, homing, simulation: see the tables.
     """
@@ -171,7 +170,6 @@ class Deployment(_Table):
     robot: str
     rate_hz: float = Field(default=100.0, ge=10.0, le=200.0)
     duration_s: float = Field(default=10.0, gt=0.0)
-    frames: str = Field(default="frames.log", pattern=r"^[\w.-]+\.(log|blf|asc|csv)$")
     goal: dict[str, float] = {}
     bus: BusTable = BusTable()
     drives: DrivesTable = DrivesTable()

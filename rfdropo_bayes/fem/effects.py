@@ -17,9 +17,7 @@ Scalar = Float[Array, ""] | float
 class BendingLaw(NamedTuple):
     """Moments of a section in response to bending and twist, beyond its profile; null 0 for all."""
 
-    fibre: Scalar = (
-        0.0  # c: stiffness E (1 - 3 c x) at small strains x; -1 St. Venant-Kirchhoff, 2/3 rubber
-    )
+    fibre: Scalar = 0.0  # c: stiffness E (1 - 3 c x) at small strains x; -1 St. Venant-Kirchhoff, 2/3 rubber
     anisotropy: Scalar = 0.0  # ln of EI in the xz plane over EI in the yz plane; their product stays
     cross_plane: Scalar = 0.0  # EI_xy / sqrt(EI_x EI_y)
     twist_x: Scalar = 0.0  # coupling of twist and rotation about x, relative to sqrt(EI GJ)
