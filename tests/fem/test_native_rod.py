@@ -173,8 +173,8 @@ def test_coupled_bending_twists_the_tip():
 
 @pytest.mark.parametrize(("c", "stretch"), [(-1.0, 0.03), (0.7, 0.2), (1.5, 0.35)])
 def test_fibres_stiffen_or_soften_with_stretch(c, stretch):
-    """Pulled along its axis a bar answers E A times the integral of (r - h)^2, h = 3 c x / 2, r^2 = 1 + h^2. At the last
-    stretch the polynomial 1 - 3 c x is below zero."""
+    """Pulled along its axis a bar answers E A times the integral of (r - h)^2, h = 3 c x / 2, r^2 = 1 + h^2. At the
+    last stretch the polynomial 1 - 3 c x is below zero."""
     area = 4.0 * HALF**2
     force = YOUNG * area * quad(lambda x: (np.hypot(1.0, 1.5 * c * x) - 1.5 * c * x) ** 2, 0.0, stretch)[0]
     law = fem.BodyEffects(bending=fem.BendingLaw(c))
