@@ -12,17 +12,18 @@ optimum at every jump of a command; and a misspecified model is also optimised f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from rfdropo_bayes.discrepancy.candidates import probe_all, start_together
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, SHARES, TOLD_APART, Added, ExtensionSearch
-from rfdropo_bayes.discrepancy.fit import Fit, best_between, heights, optimise
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, best_between, heights, optimise
 from rfdropo_bayes.discrepancy.inadequacy import misspecified
-from rfdropo_bayes.discrepancy.score import joint_statistic
-from rfdropo_bayes.discrepancy.score_tests import ScoreTests, run_score_tests
+from rfdropo_bayes.discrepancy.score import joint_statistic, project_out, span
+from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests, run_score_tests
+from rfdropo_bayes.discrepancy.unknown_size import gram_evidence
 
 PAIRS = 3  # that are refitted
 
@@ -30,7 +31,8 @@ PAIRS = 3  # that are refitted
 def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str], single: Added | None) -> list[Added]:
     """Two mechanisms at once, if the best leaves most of a large misfit; empty if they do not pay.
 
-    Pairs are ranked by the linear model, and the leading pairs are refitted.
+    Pairs are ranked by the evidence of their linear effects, as single candidates are, and the leading pairs are
+    refitted.
 
     Args:
         search: search beside the present model.
@@ -38,8 +40,6 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         named: mechanisms in it.
         single: the best single mechanism; None without it.
     """
-    if search.room(len(named)) < 2:
-        return []
     fit, last, target = tests.fit, single.fit if single else tests.fit, search.target
     taken = float(fit.residual @ fit.residual - last.residual @ last.residual)
     if not misspecified(single.fit_target if single else target, last.x):
@@ -53,7 +53,8 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         if a.name != b.name and a.probe and b.probe
     }
     worth = search.rules.evidence + np.log(len(search.candidates))
-    leading = sorted((p for p in drops if drops[p] > taken + 2.0 * worth), key=lambda p: -drops[p])[:PAIRS]
+    evidence = _linear_evidence(target, fit, rows, [p for p in drops if drops[p] > taken + 2.0 * worth])
+    leading = sorted(evidence, key=lambda names: -evidence[names])[:PAIRS]
     fits = {}
     for names in leading:
         probes = [probe for name in names if (probe := rows[name].probe)]
@@ -79,6 +80,24 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         Added(first, (first,), tests, alone[first], own, single.refits if single else {}, target),
         Added(second, (second,), between, fits[best], further, {}, target),
     ]
+
+
+def _linear_evidence(
+    target: FitTarget, fit: Fit, rows: Mapping[str, ScoreRow], pairs: Sequence[tuple[str, ...]]
+) -> dict[tuple[str, ...], float]:
+    """Evidence of the linear effects of pairs, see `unknown_size`."""
+    names = sorted({name for pair in pairs for name in pair})
+    probes = {name: probe for name in names if (probe := rows[name].probe)}
+    usual = target.forward.coordinates.prior_sd
+    effects = [p.columns * (usual[list(p.amplitudes)] if p.amplitudes else 1.0) for p in probes.values()]
+    if not effects:
+        return {}
+    effect = project_out(span(fit.jacobian), np.concatenate(effects, axis=1))
+    gram, moment = effect.T @ effect, effect.T @ fit.residual
+    ends = np.cumsum([0, *(each.shape[1] for each in effects)])
+    place = {name: np.arange(*ends[k : k + 2]) for k, name in enumerate(probes)}
+    own = {pair: np.concatenate([place[name] for name in pair]) for pair in pairs}
+    return {pair: gram_evidence(gram[np.ix_(at, at)], moment[at]) for pair, at in own.items()}
 
 
 def optimised_again(search: ExtensionSearch, step: Added) -> Fit | None:

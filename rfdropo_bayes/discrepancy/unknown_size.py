@@ -47,10 +47,15 @@ def linear_evidence(effect: Float[np.ndarray, "n d"], residual: Float[np.ndarray
         residual: whitened residual of the base model.
         sign: +1 or -1 if a single size has only this sign; else 0.
     """
-    vectors, values, _ = np.linalg.svd(effect, full_matrices=False)
-    score, seen = vectors.T @ residual, np.outer(SCALES, values) ** 2
-    each = 0.5 * np.sum(seen / (1.0 + seen) * score**2 - np.log1p(seen), axis=1)
+    return gram_evidence(effect.T @ effect, effect.T @ residual, sign)
+
+
+def gram_evidence(gram: Float[np.ndarray, "d d"], moment: Float[np.ndarray, " d"], sign: int = 0) -> float:
+    """`linear_evidence` by the products of the effects of sizes with one another, and with the residual."""
+    values, vectors = np.linalg.eigh(gram)
+    square, along = SCALES[:, None] ** 2, vectors.T @ moment
+    seen = square * np.clip(values, 0.0, None)
+    each = 0.5 * np.sum(square / (1.0 + seen) * along**2 - np.log1p(seen), axis=1)
     if sign:
-        along = float(effect[:, 0] @ residual) / max(float(values[0]), 1e-300)
-        each += np.log(2.0) + norm.logcdf(sign * along * np.sqrt(seen[:, 0] / (1.0 + seen[:, 0])))
+        each += np.log(2.0) + norm.logcdf(sign * moment[0] * SCALES / np.sqrt(1.0 + seen[:, 0]))
     return float(logsumexp(each) - np.log(len(SCALES)))
