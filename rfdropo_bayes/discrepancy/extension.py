@@ -36,6 +36,7 @@ class Rules:
         family: probability that the score tests name a candidate although the model is right.
         class_cosine: cosine above which signatures are one class.
         classes: number of leading classes to refit; members: total number of candidates to refit.
+        effects: most mechanisms added to a model that is not misspecified.
         evidence: log Bayes factor required to add a mechanism. Later mechanisms need the logarithm of the number of
             candidates in addition, since a few of many candidates together imitate most effects. Candidates within this
             difference of the best are equivalent.
@@ -50,6 +51,7 @@ class Rules:
     class_cosine: float = 0.95
     classes: int = 4
     members: int = 8
+    effects: int = 3
     evidence: float = 3.0
     bootstraps: int = 999
     minutes: float = 30.0
@@ -135,6 +137,12 @@ class ExtensionSearch:
     def candidate(self, name: str) -> Candidate | None:
         """A candidate by its name; None for `DISCRETISATION`."""
         return next((each for each in self.candidates if each.name == name), None)
+
+    def room(self, steps: int) -> int:
+        """Number of mechanisms that may still be added. A misspecified model may lack many, and down-weighted rows keep
+        out imitations.
+        """
+        return len(self.candidates) if self.target.known is not None else self.rules.effects - steps
 
     def score_tests(self, fit: Fit, without: Sequence[str] = ()) -> ScoreTests:
         """Test a fit and its missing candidates.

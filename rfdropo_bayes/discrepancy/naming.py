@@ -116,7 +116,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
             return
         first = tests.rows[0].name if tests.rows else "none"
         report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")
-        if p > rules.extended_passes:
+        if named.asked.room(len(named.steps)) < 1 or p > rules.extended_passes:
             return
         if frozenset(named.names) in extended:
             return
