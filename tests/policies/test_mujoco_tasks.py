@@ -123,5 +123,6 @@ def test_a_policy_is_trained_evaluated_and_filmed(tmp_path):
     found = rb.evaluate(model, [tmp_path / "policy"], tmp_path / "no_cables", episodes=8, film=False)
     assert found["tension_limit_n"] is None
     assert "tension_limit of 50 N is left out: the model has no cables" in found["otherwise_trained"][0]
+    asked = rb.TrainingOptions(tension_limit=50.0)
     with pytest.raises(InputError, match="gives no cable tensions"):
-        rb.evaluate(model, [tmp_path / "policy"], tmp_path / "asked", episodes=8, film=False, tension_limit=50.0)
+        rb.evaluate(model, [tmp_path / "policy"], tmp_path / "asked", asked, episodes=8, film=False)
