@@ -121,8 +121,8 @@ def energy(section: Sections, strain: Float[Array, "6 ..."]) -> Float[Array, "..
     small = jnp.abs(h) < 1e-3
     x = jnp.where(small, 1.0, h)
     cubed = x * (2.0 * x**2 + 5.0) * jnp.sqrt(1.0 + x**2) / 8.0 + 0.375 * jnp.arcsinh(x)  # integral of r^3
-    share = 0.5 + x**2 / 6.0 - 2.0 / 3.0 * (cubed - x) / x**2
-    share = jnp.where(small, 0.5 - h / 3.0 + h**2 / 6.0, share)
+    exact = 0.5 + x**2 / 6.0 - 2.0 / 3.0 * (cubed - x) / x**2
+    share = jnp.where(small, 0.5 - h / 3.0 + h**2 / 6.0, exact)
     bent = 0.5 * (fibres(section.fibre, stretch).tangent - 1.0) * dot(moment, strain[3:5])
     return result + section.stretch[2] * stretch**2 * (share - 0.5) + bent
 

@@ -72,3 +72,14 @@ def test_no_effect_is_no_evidence_and_no_parameter_no_gain():
     effect = np.random.default_rng(4).standard_normal((100, 2))
     assert -5.0 < linear_evidence(effect, np.zeros(100)) < 0.0
     assert scale_gain(np.zeros(0), np.zeros((0, 0))) == 0.0
+
+
+def test_two_effects_have_more_evidence_than_one_of_them_beside_a_family_that_fits_as_well():
+    """The family holds the second effect; the drop of the sum of squares alone prefers it. One fixed draw."""
+    rng = np.random.default_rng(3)
+    first, second, others = (rng.normal(size=(400, k)) for k in (1, 1, 11))
+    residual = 0.4 * first[:, 0] + 0.4 * second[:, 0] + rng.normal(size=400)
+    pair, family = np.hstack([first, second]), np.hstack([first, second, others])
+    drop, larger = (np.linalg.lstsq(each, residual, rcond=None)[1][0] for each in (pair, family))
+    assert larger < drop
+    assert linear_evidence(pair, residual) > linear_evidence(family, residual) + 1.0

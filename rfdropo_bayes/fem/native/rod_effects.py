@@ -1,6 +1,6 @@
 """Effects of the body in SIMD lanes: laws of the section, Prony branch, softening, fluid, wall and stretching cables.
 
-The physics follows ``fem.bending_law``, ``fem.surroundings`` and ``fem.dynamics``. Absent effects are skipped by flags
+The physics follows ``fem.sections``, ``fem.surroundings`` and ``fem.dynamics``. Absent effects are skipped by flags
 that are the same for all lanes; cables and softening cost little and are always computed.
 """
 
