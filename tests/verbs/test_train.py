@@ -52,7 +52,7 @@ def rfdropo(*words: object) -> str:
 @pytest.mark.slow
 def test_an_arm_of_another_length_needs_goals_of_its_own() -> None:
     long = Robot.outline(name="long", length=0.3, radius=0.01, markers={"tip": 0.3})
-    with pytest.raises(rb.InputError, match="a trunk of 195 mm, and long has 300 mm"):
+    with pytest.raises(rb.InputError, match="a trunk of 195 mm, but long has 300 mm"):
         rb.make_vec("TrunkReach-v0", rb.Model(long), n=1)
     venv = rb.make_vec("TrunkReach-v0", rb.Model(long), n=1, options=rb.TrainingOptions(goals=GOALS))
     venv.reset()
