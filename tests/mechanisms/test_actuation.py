@@ -63,7 +63,7 @@ def test_each_drive_follows_with_its_own_lag():
     (made,) = mechanisms_named(["cable_lag"], Robot.load("smooth_arm"))
     assert [spec.name for spec in made.parameters] == [f"cable_lag_{c}" for c in ("up", "left", "down", "right")]
     own = act("cable_lag", cable_lag_1=0.2, cable_lag_2=0.0)
-    np.testing.assert_array_equal(own[:, 0], act("actuator_lag", actuator_lag=0.2)[:, 0])
+    np.testing.assert_allclose(own[:, 0], act("actuator_lag", actuator_lag=0.2)[:, 0], rtol=1e-12)
     np.testing.assert_array_equal(own[:, 1], RAMP[:, 1])
 
 
