@@ -22,9 +22,10 @@ N = 2000
 class Product(LinearGaussian):
     """A product of two parameters is observed: the posterior is a piece of a hyperbola."""
 
-    def __init__(self, fails_above: float = np.inf, centre: float = CENTRE) -> None:
+    def __init__(self, fails_above: float = np.inf, centre: float = CENTRE, unit: float = 1.0) -> None:
         super().__init__(n_rows=ROWS, d=2)
-        self.mean, self.sd = np.full(2, centre), np.full(2, SPREAD)
+        self.unit = np.array([1.0, unit])
+        self.mean, self.sd = centre * self.unit, SPREAD * self.unit
         self.fails_above = fails_above
 
     def log_prior(self, u):
@@ -32,7 +33,7 @@ class Product(LinearGaussian):
 
     def row_log_likelihood(self, values, horizon):
         u = np.asarray(self.to_unconstrained(values))
-        rows = -0.5 * ((SEEN - u.prod(axis=1)) / NOISE) ** 2 - np.log(NOISE)
+        rows = -0.5 * ((SEEN - (u / self.unit).prod(axis=1)) / NOISE) ** 2 - np.log(NOISE)
         return np.repeat(rows[:, None], horizon, axis=1), (u[:, 0] > self.fails_above).astype(int)
 
 
@@ -74,6 +75,16 @@ def test_a_curved_ridge_is_what_quadrature_says():
     assert 300.0 < found.effective < 1800.0
     assert (ledger.evaluations, found.candidates) == (N, N)
     np.testing.assert_allclose(found.rows.sum(axis=1).max(), -ROWS * np.log(NOISE), atol=0.01)
+
+
+def test_units_of_parameters_do_not_matter():
+    """A size of a law in metres has a variance of 1e-12 beside others of 1."""
+    mode, unit = normal_at_the_optimum(), np.array([1.0, 1e-6])
+    small = Laplace(mode.mean * unit, mode.covariance * np.outer(unit, unit), 0.0)
+    plain = reweighted(Product(), [mode], N, KEY, Ledger(), N)
+    scaled = reweighted(Product(unit=1e-6), [small], N, KEY, Ledger(), N)
+    np.testing.assert_allclose(scaled.position / unit, plain.position, rtol=1e-6)
+    assert scaled.effective == pytest.approx(plain.effective, rel=1e-6)
 
 
 def test_a_normal_posterior_needs_no_weights():
