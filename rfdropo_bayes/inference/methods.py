@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import types
+import json
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxtyping import PRNGKeyArray
+from pydantic import TypeAdapter, ValidationError
 
 from rfdropo_bayes.bayes.problem import Problem, check_problem
 from rfdropo_bayes.errors import InputError
@@ -72,7 +73,7 @@ def make_config(name: str, options: Mapping[str, Any]) -> Any:
     for option in options:
         if option not in names:
             raise InputError(f"unknown option {option!r}", where=where, remedy=nearest(option, [*names, "method"]))
-    return kind(**{option: _convert(hints[option], value, f"{where} {option}") for option, value in options.items()})
+    return kind(**{option: _checked(hints[option], value, f"{where} {option}") for option, value in options.items()})
 
 
 def run(
@@ -106,33 +107,11 @@ def run(
     return method.run(problem, config, key, Logbook(checkpoint_dir, resume, progress))
 
 
-def _convert(hint: Any, value: Any, where: str) -> Any:
-    """Value of an option as its field wants it; TOML has lists for tuples and writes 20000 for 20000.0."""
-    value = plain(value)
-    choices = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-    for choice in choices:
-        origin = typing.get_origin(choice) or choice
-        if choice is type(None) and value is None:
-            return None
-        if origin is bool and isinstance(value, bool):
-            return value
-        if origin is int and isinstance(value, int) and not isinstance(value, bool):
-            return value
-        if origin is float and isinstance(value, int | float) and not isinstance(value, bool):
-            return float(value)
-        if origin is str and isinstance(value, str):
-            return value
-        if origin is tuple and isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
-            return tuple(value)
-        if isinstance(origin, type) and issubclass(origin, Mapping) and isinstance(value, Mapping):
-            return {name: _pair(item, f"{where}.{name}") for name, item in value.items()}
-    wanted = " or ".join(getattr(choice, "__name__", str(choice)) for choice in choices if choice is not type(None))
-    raise InputError(f"{value!r} is not of type {wanted}", where=where)
-
-
-def _pair(value: Any, where: str) -> tuple[float, float]:
-    if isinstance(value, list | tuple) and len(value) == 2:
-        low, high = value
-        if all(isinstance(x, int | float) and not isinstance(x, bool) for x in (low, high)):
-            return float(low), float(high)
-    raise InputError(f"{value!r} is not a range", where=where, remedy="give [low, high]")
+def _checked(hint: Any, value: Any, where: str) -> Any:
+    """Value of an option as its field wants it; TOML, as JSON, has lists for tuples and writes 20000 for 20000.0."""
+    try:
+        return TypeAdapter(hint).validate_json(json.dumps(plain(value)), strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[-1]
+        place = ".".join([where, *map(str, first["loc"])])
+        raise InputError(f"{value!r} does not fit: {first['msg']}", where=place, remedy="correct the value") from None

@@ -27,10 +27,10 @@ OWN = [name for name, own in methods.METHODS.items() if own.config.__module__.st
         ("smc", {"finalists": 5}, "unknown option 'finalists'"),
         ("smc", {"metod": "laplace"}, "did you mean 'method'"),
         ("rfdropo", {"rolouts": 100}, "did you mean 'rollouts'"),
-        ("smc", {"particles": "many"}, "'many' is not of type int"),
-        ("smc", {"particles": True}, "True is not of type int"),
-        ("rfdropo", {"search": {"frequency": [1.0]}}, "is not a range"),
-        ("rfdropo", {"parameters": "frequency"}, "is not of type"),
+        ("smc", {"particles": "many"}, "'many' does not fit: Input should be a valid integer"),
+        ("smc", {"particles": True}, "True does not fit: Input should be a valid integer"),
+        ("rfdropo", {"search": {"frequency": [1.0]}}, "does not fit"),
+        ("rfdropo", {"parameters": "frequency"}, "does not fit"),
     ],
 )
 def test_a_wrong_option_is_named_with_what_was_meant(method, options, words):
