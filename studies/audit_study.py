@@ -233,6 +233,7 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
         "hidden": names,
         "unreached": unreached,
         "rho": hidden.rho,
+        "ideal": hidden.ideal,
         "truth": hidden.values,
         **judged,
         "seconds": round(time.monotonic() - began, 1),
@@ -357,12 +358,14 @@ def summarise(condition: Condition, rows: Sequence[Mapping[str, Any]]) -> dict[s
     every = [value for row in rows for value in row["covered"].values()]
     ratios = [r["error_over_oracle"] for r in rows if r["error_over_oracle"] is not None and r["named_first"]]
     sizes = [row["class_sizes"][0] for row in rows if row["class_sizes"]]
+    ideal = [min(row["ideal"].values()) for row in rows if row.get("ideal")]
     return {
         "datasets": len(rows),
         "verdicts": verdicts,
         "right_verdict": sum(row["verdict"] in condition.right for row in rows),
         "unreached": sorted({name for row in rows for name in row["unreached"]}),
         "named_first": sum(row["named_first"] for row in rows),
+        "ideal": float(np.mean(ideal)) if ideal else None,
         "all_named": sum(row["all_named"] for row in rows),
         "median_class_size": float(np.median(sizes)) if sizes else None,
         "intervals": [sum(covered), len(covered)],
@@ -381,18 +384,19 @@ def as_table(content: Mapping[str, Any]) -> str:
         f"Seed {content['seed']}; {content['hours']} hours, {content['core_hours']} of them processor time; mechanisms "
         f"neither hidden nor tried: {without}. In brackets: exact 95 % intervals of the rates, in %.",
         "",
-        "| condition | data sets | verdicts | right verdict | named first | all named | median class | "
-        "90 % intervals cover | error within 1.3 of the oracle's | largest discretisation rho |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| condition | data sets | verdicts | right verdict | named first | found by an ideal test | all named | "
+        "median class | 90 % intervals cover | error within 1.3 of the oracle's | largest discretisation rho |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in content["conditions"].items():
         verdicts = ", ".join(f"{verdict} {count}" for verdict, count in sorted(row["verdicts"].items()))
         share = "{} of {}".format(*row["intervals"]) if row["intervals"][1] else "-"
         near = "-" if row["within_1.3_of_the_oracle"] is None else f"{100 * row['within_1.3_of_the_oracle']:.0f} %"
+        ideal = "-" if row["ideal"] is None else f"{100 * row['ideal']:.0f} %"
         rho = max(row["discretisation_rho"], default=0.0)
         right, first, every = (_rate(row, key) for key in ("right_verdict", "named_first", "all_named"))
         lines.append(
-            f"| {name} | {row['datasets']} | {verdicts} | {right} | {first} | {every} | "
+            f"| {name} | {row['datasets']} | {verdicts} | {right} | {first} | {ideal} | {every} | "
             f"{row['median_class_size'] or '-'} | {share} | {near} | {rho:.3f} |"
         )
     confusions = ((name, row["confusions"]) for name, row in content["conditions"].items())

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from scipy.stats import chi2, ncx2
 
 from rfdropo_bayes.bayes.channels.tension import reading_size
 from rfdropo_bayes.bayes.noise import Noise, draw_noise
@@ -84,12 +85,15 @@ class Hidden:
     Attributes:
         values: true parameters, base and hidden, by name.
         rho: of each hidden mechanism, and ``discretisation`` for that of the mesh and time step.
+        ideal: chance that a test finds each hidden mechanism among all candidates, at the audit's level, if it knows
+            the noise and the mechanism's directions.
         folder: of the recordings and the experiment file.
         clean: noise-free untouched recordings [m].
     """
 
     values: dict[str, float]
     rho: dict[str, float]
+    ideal: dict[str, float]
     folder: Path
     clean: Float[np.ndarray, "trajectory time channel"]
 
@@ -146,12 +150,18 @@ def hide(
     channels = tuple(replace(c, readings=part) for c, part in zip(measurements.channels, read, strict=False))
     plain = replace(measurements, channels=channels, count=measurements.valid.astype(float))
     target = FitTarget(forward, plain, white)
-    sizes = {}
+    memory = Autoregression(np.full(widths[0], NOISE), np.array([1.0, MEMORY]), STATED, np.inf)
+    measured = FitTarget(forward, measurements, replace(white, parts=(memory, *white.parts[1:])))
+    sizes, ideal = {}, {}
     for name in mechanisms:
         index = next(c.indices for c in problem.candidates if c.name == name)
         moved = _sized(target, truth, index, rho, rng)
         if moved is None:
             return None
+        base = span(measured.jacobian(truth, np.arange(coordinates.base)))
+        effect = project_out(base, (measured.residual(truth[None]) - measured.residual(moved[None])).T)
+        level = problem.rules.base_passes / len(problem.candidates)
+        ideal[name] = float(ncx2.sf(chi2.isf(level, len(index)), len(index), np.sum(effect**2)))
         truth = moved
         sizes[name] = rho
     values = {n: v for n, v in coordinates.named(truth).items() if _belongs(problem, n, mechanisms)}
@@ -161,7 +171,7 @@ def hide(
     sizes["discretisation"] = _discretisation(target, truth, made, measurements.members)
     _write(setting, experiment, blank, made, seed, out)
     untouched_rows = np.asarray(made.position)[REPEATS + 1 :]
-    return Hidden(values, sizes, out, untouched_rows.reshape(*untouched_rows.shape[:2], -1))
+    return Hidden(values, sizes, ideal, out, untouched_rows.reshape(*untouched_rows.shape[:2], -1))
 
 
 def _belongs(problem: Any, name: str, mechanisms: Sequence[str]) -> bool:

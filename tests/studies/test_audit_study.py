@@ -38,7 +38,13 @@ PRIOR = {"payload_mass": 0.1}
 
 
 def hidden(mass: float) -> Hidden:
-    return Hidden({"payload_mass": mass, "young_modulus": 2e6}, {"discretisation": 0.01}, Path(), np.zeros((6, 1, 1)))
+    return Hidden(
+        {"payload_mass": mass, "young_modulus": 2e6},
+        {"discretisation": 0.01},
+        {"payload_mass": 0.9},
+        Path(),
+        np.zeros((6, 1, 1)),
+    )
 
 
 def test_a_size_is_judged_in_the_form_that_can_be_known():
@@ -73,7 +79,12 @@ def test_every_mechanism_has_its_turn_before_one_has_its_second():
 def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
     def line(index: int, name: str, ratio: float | None, seed: int = 7) -> str:
         judged = judge(CONTENT, [name], hidden(0.02), PRIOR)
-        result = {"hidden": [name], "rho": {"discretisation": 0.01 * index}, **judged}
+        result = {
+            "hidden": [name],
+            "rho": {"discretisation": 0.01 * index},
+            "ideal": {name: 0.8 + 0.05 * index},
+            **judged,
+        }
         job = {"condition": "rho_0.5", "index": index, "seed": seed}
         return json.dumps(
             {
@@ -100,7 +111,8 @@ def test_a_study_counts_what_its_ledger_holds_and_lists_confusions(tmp_path):
     assert found["hours"] == pytest.approx(0.03)
     assert found["core_hours"] == pytest.approx(0.015)
     table = (tmp_path / TABLE).read_text()
-    assert "| rho_0.5 | 3 | equivalent 3 | 3 [29, 100] | 2 [9, 99] | 2 [9, 99] | 2.0 | 2 of 2 | 50 % | 0.020 |" in table
+    shown = "| rho_0.5 | 3 | equivalent 3 | 3 [29, 100] | 2 [9, 99] | 85 % | 2 [9, 99] | 2.0 | 2 of 2 | 50 % | 0.020 |"
+    assert shown in table
     assert "backlash -> payload (1)" in table
     with pytest.raises(InputError, match="unknown condition"):
         run_study(tmp_path, 0, 7, conditions=["rho_9"])
