@@ -3,50 +3,25 @@ file asks for one as ``studies.fresh_laws:Crosstalk``; audits do not know them."
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import ClassVar
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from rfdropo_bayes.mechanisms.actuation import NUMBERED
+from rfdropo_bayes.mechanisms.actuation import PerChannel
 from rfdropo_bayes.mechanisms.default_priors import half_normal
-from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.mechanisms import MemorylessActuation, SteppedActuation, Values
 from rfdropo_bayes.simulators.parameters import ParameterSpec
 
 BOUC_WEN_WAY = 1.5e-3  # m of travel over which a hysteresis builds up
 
 
-class CableEffect:
-    """Base of the laws: a size of its own for each command channel, zero at null. For robots commanded in metres.
+class CableEffect(PerChannel):
+    """Base of the laws: a size of its own for each command channel, zero at null; the scale of its prior is the law's
+    usual size. For robots commanded in metres."""
 
-    Args:
-        channels: names of the command channels; numbers by default.
-
-    Attributes:
-        size: of one channel; its nominal value is zero, the scale of its prior the law's usual size.
-    """
-
-    size: ClassVar[ParameterSpec]
-    name: str
     stage = "actuation"
     inside_drive = False
     cause = "test code"
     remedy = "none: a law of test code"
-    parameters: tuple[ParameterSpec, ...]
-
-    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
-        self.parameters = tuple(self.size._replace(name=f"{self.name}_{channel}") for channel in channels)
-
-    @classmethod
-    def for_robot(cls, robot: Robot) -> CableEffect:
-        """One size for every command channel of a robot."""
-        return cls(robot.channel_names)
-
-    def sizes(self, values: Values, count: int) -> Float[Array, " channel"]:
-        """The sizes of the first ``count`` channels."""
-        return jnp.stack([values[spec.name] for spec in self.parameters[:count]])
 
 
 def _size(name: str, unit: str, high: float, usual: float, description: str) -> ParameterSpec:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -57,6 +57,36 @@ def in_unit(spec: ParameterSpec, unit: str, per_metre: float) -> ParameterSpec:
     return scaled(spec, per_metre ** POWERS[spec.unit])._replace(unit=word.join(spec.unit.rsplit("m", 1)))
 
 
+class PerChannel:
+    """Base of mechanisms with a size of its own for each command channel.
+
+    Args:
+        channels: names of the command channels; numbers by default.
+
+    Attributes:
+        size: parameter of one channel, whose name and description the channel's name is added to.
+    """
+
+    size: ClassVar[ParameterSpec]
+    parameters: tuple[ParameterSpec, ...]
+
+    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
+        one = self.size
+        self.parameters = tuple(
+            one._replace(name=f"{one.name}_{channel}", description=f"{one.description} of {channel}")
+            for channel in channels
+        )
+
+    @classmethod
+    def for_robot(cls, robot: Robot) -> Self:
+        """One size for every command channel of a robot."""
+        return cls(robot.channel_names)
+
+    def sizes(self, values: Values, count: int) -> Float[Array, " channel"]:
+        """The sizes of the first ``count`` channels."""
+        return jnp.stack([values[spec.name] for spec in self.parameters[:count]])
+
+
 class CommandDelay:
     """Pure transport delay: the command acts ``command_delay`` seconds late; zero is the base simulator."""
 
@@ -96,37 +126,22 @@ class CommandDelay:
         return _read_late(step, values["command_delay"] / interval, lambda at: history[at % len(history)])
 
 
-class CableDelay(CommandDelay):
-    """Each command acts by its own delay late; zero at null. Equal delays of all are `command_delay`'s.
-
-    Args:
-        channels: names of the command channels; numbers by default.
-    """
+class CableDelay(PerChannel, CommandDelay):
+    """Each command acts by its own delay late; zero at null. Equal delays of all are `command_delay`'s."""
 
     name = "cable_delay"
     cause = "a drive that answers later than others: its bus, its controller, or its own filter"
     remedy = "command all drives at once, and compare the stamps of their first motion"
-
-    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
-        self.parameters = tuple(
-            ParameterSpec(f"cable_delay_{channel}", "s", 0.0, 2.0, 0.0, half_normal(0.1), f"delay of {channel}")
-            for channel in channels
-        )
-
-    @classmethod
-    def for_robot(cls, robot: Robot) -> CableDelay:
-        """One delay for every command channel of a robot."""
-        return cls(robot.channel_names)
+    size = ParameterSpec("cable_delay", "s", 0.0, 2.0, 0.0, half_normal(0.1), "delay")
 
     def _late(
         self, values: Values, interval: float, step: Int[Array, "*step"], history: Float[Array, "kept channel"]
     ) -> Float[Array, "*step channel"]:
-        delay = jnp.stack([values[spec.name] for spec in self.parameters[: history.shape[1]]])
-
         def own(late: Float[Array, ""], past: Float[Array, " kept"]) -> Float[Array, "*step"]:
             return _read_late(step, late, lambda at: past[at % len(past)][..., None])[..., 0]
 
-        return jax.vmap(own, in_axes=(0, 1), out_axes=-1)(delay / interval, history)
+        late = self.sizes(values, history.shape[1]) / interval
+        return jax.vmap(own, in_axes=(0, 1), out_axes=-1)(late, history)
 
 
 def _read_late(
@@ -170,30 +185,16 @@ class ActuatorLag(SteppedActuation):
         return values["actuator_lag"]
 
 
-class CableLag(ActuatorLag):
-    """Each drive follows with a first-order lag of its own; zero at null. Equal lags of all are `actuator_lag`'s.
-
-    Args:
-        channels: names of the command channels; numbers by default.
-    """
+class CableLag(PerChannel, ActuatorLag):
+    """Each drive follows with a first-order lag of its own; zero at null. Equal lags of all are `actuator_lag`'s."""
 
     name = "cable_lag"
     cause = "a drive that follows more slowly than others: its load, its gains, or friction of its cable"
     remedy = "step each drive alone, and compare the rise of their encoders"
-
-    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
-        self.parameters = tuple(
-            ParameterSpec(f"cable_lag_{channel}", "s", 0.0, 5.0, 0.0, half_normal(0.2), f"time constant of {channel}")
-            for channel in channels
-        )
-
-    @classmethod
-    def for_robot(cls, robot: Robot) -> CableLag:
-        """One lag for every command channel of a robot."""
-        return cls(robot.channel_names)
+    size = ParameterSpec("cable_lag", "s", 0.0, 5.0, 0.0, half_normal(0.2), "time constant")
 
     def _times(self, values: Values, channels: int) -> Float[Array, "*channel"]:
-        return jnp.stack([values[spec.name] for spec in self.parameters[:channels]])
+        return self.sizes(values, channels)
 
 
 class CommandGain(MemorylessActuation):
@@ -215,43 +216,20 @@ class CommandGain(MemorylessActuation):
         return (1.0 + values["command_gain_error"]) * sent
 
 
-class CableGain(MemorylessActuation):
-    """Each command scaled by its own ``1 + error``; zero at null. Equal errors of all are `command_gain`'s.
-
-    Args:
-        channels: names of the command channels; numbers by default.
-    """
+class CableGain(PerChannel, MemorylessActuation):
+    """Each command scaled by its own ``1 + error``; zero at null. Equal errors of all are `command_gain`'s."""
 
     name = "cable_gain"
     stage = "actuation"
     inside_drive = False
     cause = "spools of different radius, cables of different stretch, or a cable that slips or is torn"
     remedy = "measure how far each cable travels for the same command"
-
-    def __init__(self, channels: Sequence[str] = NUMBERED) -> None:
-        self.parameters = tuple(
-            ParameterSpec(
-                f"cable_gain_error_{channel}",
-                "-",
-                -1.0,  # a cable that does not pull at all
-                2.0,
-                0.0,
-                normal(0.2),
-                f"relative error of the displacement of {channel}",
-            )
-            for channel in channels
-        )
-
-    @classmethod
-    def for_robot(cls, robot: Robot) -> CableGain:
-        """One error for every command channel of a robot."""
-        return cls(robot.channel_names)
+    # At -1 a cable does not pull at all.
+    size = ParameterSpec("cable_gain_error", "-", -1.0, 2.0, 0.0, normal(0.2), "relative error of the displacement")
 
     def reach(self, values: Values, sent: Float[Array, "*step channel"]) -> Float[Array, "*step channel"]:
         """Scale each command, from zero on."""
-        count = sent.shape[-1]
-        error = jnp.stack([values[spec.name] for spec in self.parameters[:count]])
-        return (1.0 + error) * sent
+        return (1.0 + self.sizes(values, sent.shape[-1])) * sent
 
 
 class CableSlack(InCommandUnit, MemorylessActuation):
