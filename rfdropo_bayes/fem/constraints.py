@@ -63,21 +63,6 @@ class Contacts(NamedTuple):
     before: Float[Array, "contacts 3"]  # impulses of the previous step, in the rows of this step [N s]
 
 
-class Impulses(NamedTuple):
-    """Impulses of a step's constraints."""
-
-    cable: Float[Array, " cables"]  # [N s], never negative
-    share: Float[Array, " runs"]  # of the cables' friction that is mobilised at the end of the step
-    slip: Float[Array, " runs"]  # [N s]
-    contact: Float[Array, "contacts 3"]  # [N s]: along the normal, never negative, and two tangents
-    converged: Bool[Array, ""]
-
-    @property
-    def all(self) -> Float[Array, " n"]:
-        """All rows one after the other."""
-        return jnp.concatenate([self.cable, self.slip, self.contact.ravel()])
-
-
 class Problem(NamedTuple):
     """Everything but the free velocities."""
 
@@ -209,45 +194,3 @@ def posed(
     softness = jnp.where(usable, CABLE_SOFTNESS * drives, jnp.inf)
     normal, tangent = NORMAL_SOFTNESS * mean, TANGENT_SOFTNESS * mean
     return Problem(compliance, softness, slips, contacts, normal, tangent, rigid, time_step)
-
-
-def solve_constraints(
-    compliance: Float[Array, "n n"],
-    free: Float[Array, " n"],
-    previous: Float[Array, " cables"],
-    time_step: Scalar,
-    *,
-    slips: Slips | None = None,
-    contacts: Contacts | None = None,
-) -> Impulses:
-    """Impulses of cables, of the slip at their guides and of contacts, which follow each other in the rows.
-
-    Differentiable in both modes: the derivatives are of the equations at the solution.
-
-    Args:
-        compliance: W [1/kg], symmetric positive semi-definite.
-        free: b [m/s]; for a cable (commanded length - length) / h, for a run of guides minus its slip, for a contact
-            its opening and sliding, without the gap.
-        previous: impulses of the cables, the start of the iterations [N s].
-        time_step: h [s].
-    """
-    cables = len(previous)
-    problem = posed(compliance, cables, time_step, slips, contacts)
-    slips, contacts = problem.slips, problem.contacts
-    runs = len(slips.impulse)
-    if not len(free):
-        return Impulses(previous, slips.mobilised, slips.impulse, jnp.zeros((0, 3)), jnp.array(True))
-    start = jnp.concatenate([previous, jnp.zeros(runs), contacts.before.ravel()])
-    impulse_value, converged = lax.stop_gradient(settle(*lax.stop_gradient((problem, free, start))))
-    # One more iteration, which carries the derivatives and changes the impulses by rounding only.
-    law = answers(problem, free + compliance @ impulse_value)
-    constant = Law(law.impulse, *lax.stop_gradient((law.line, law.block)))
-    impulse = impulse_value + _newton_step(problem, constant, impulse_value)
-    share = slips.mobilised - time_step / PRESLIDING * (free + compliance @ impulse)[cables : cables + runs]
-    return Impulses(
-        jnp.maximum(impulse[:cables], 0.0),
-        jnp.clip(share, -1.0, 1.0),
-        impulse[cables : cables + runs],
-        impulse[cables + runs :].reshape(-1, 3),
-        converged,
-    )

@@ -13,9 +13,11 @@ from rfdropo_bayes import fem
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.fem.cables import courses, lengths, rest_lengths, routes, station_rows, threads
 from rfdropo_bayes.fem.components import rotation, turned
-from rfdropo_bayes.fem.constraints import CABLE_SOFTNESS, solve_constraints
+from rfdropo_bayes.fem.constraints import CABLE_SOFTNESS
 from rfdropo_bayes.fem.lanes import laned
 from rfdropo_bayes.fem.stage_solve import settle_cables
+
+from .constraint_solution import solve_constraints
 
 solve_tensions = jax.jit(lambda compliance, slack, start: solve_constraints(compliance, slack, start, 1.0))
 

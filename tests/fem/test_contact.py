@@ -12,14 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rfdropo_bayes.fem.constraints import (
-    CABLE_SOFTNESS,
-    NORMAL_SOFTNESS,
-    TANGENT_SOFTNESS,
-    Contacts,
-    Slips,
-    solve_constraints,
-)
+from rfdropo_bayes.fem.constraints import CABLE_SOFTNESS, NORMAL_SOFTNESS, TANGENT_SOFTNESS, Contacts, Slips
 from rfdropo_bayes.fem.pushing import FITTED, contact_frame, distance_to_box, mesh_spheres
 from rfdropo_bayes.fem.rigid_body import (
     CORNERS,
@@ -32,6 +25,8 @@ from rfdropo_bayes.fem.rigid_body import (
     rotation_matrix,
     solid_gyration_radius,
 )
+
+from .constraint_solution import solve_constraints
 
 MASS, SIDE, TIME_STEP, GRAVITY = 0.05, 0.035, 0.01, 9.81
 UP = np.array([0.0, 1.0, 0.0])
@@ -185,7 +180,9 @@ def test_the_solution_obeys_every_law_and_is_the_least_of_its_function(seed, fri
         Slips(jnp.asarray(limit), jnp.asarray(mobilised)),
         Contacts(jnp.asarray(opening), friction, jnp.asarray(before)),
     )
-    found = constraints(jnp.asarray(compliance), jnp.asarray(free), jnp.zeros(cables), 0.01, slips, touching)
+    found = jax.jit(solve_constraints)(
+        jnp.asarray(compliance), jnp.asarray(free), jnp.zeros(cables), 0.01, slips, touching
+    )
     assert bool(found.converged)
     impulse = np.asarray(found.all)
     velocity = compliance @ impulse + free
@@ -213,36 +210,6 @@ def test_the_solution_obeys_every_law_and_is_the_least_of_its_function(seed, fri
         + friction**2 * TANGENT_SOFTNESS * (mean * normal)[normal > 1e-9]
         + 1e-9
     )
-
-
-@jax.jit
-def constraints(compliance, free, previous, time_step, slips, contacts):
-    return solve_constraints(compliance, free, previous, time_step, slips=slips, contacts=contacts)
-
-
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_derivatives_are_those_of_the_solution(seed):
-    """Along random changes of everything, in both modes: as differences say."""
-    rng = np.random.default_rng(seed)
-    factor = rng.normal(size=(11, 22))
-    change = rng.normal(size=(11, 11))
-    start, shift = rng.normal(size=11), rng.normal(size=11)
-    opening, along = rng.normal(size=2), rng.normal(size=2)
-    before = jnp.asarray(rng.normal(size=(2, 3)))
-
-    def solved(step):
-        moved = jnp.asarray(factor @ factor.T) + step * jnp.asarray(change + change.T)
-        slips = Slips(jnp.asarray([0.05, 0.02]) * (1.0 + step), jnp.asarray([0.3, -0.2]) + 0.1 * step)
-        contacts = Contacts(jnp.asarray(opening) + step * jnp.asarray(along), 0.3 + 0.5 * step, (1.0 + step) * before)
-        free = jnp.asarray(start) + step * jnp.asarray(shift)
-        return constraints(moved, free, jnp.zeros(3), 0.01, slips, contacts).all
-
-    weight = jnp.asarray(rng.normal(size=11))
-    forward = jax.jit(lambda step: jax.jvp(solved, (step,), (1.0,))[1])(0.0)
-    backward = jax.jit(jax.grad(lambda step: weight @ solved(step)))(0.0)
-    ahead, behind = (jax.jit(solved)(step) for step in (1e-6, -1e-6))
-    np.testing.assert_allclose(forward, (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-6)
-    np.testing.assert_allclose(backward, weight @ forward, rtol=1e-8)
 
 
 def test_spheres_of_a_mesh_follow_affine_motions():
