@@ -27,8 +27,11 @@ from rfdropo_bayes.bayes.problem import BatchedResiduals, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.optimisation import positive_part
 
-DIFFERENCE = 1e-4  # step of central differences; unconstrained coordinates are of order 1
-BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
+# Steps of central differences, in the prior's deviations of each unconstrained coordinate, which may be metres.
+DIFFERENCE = 1e-4
+BATCH_DIFFERENCE = 1e-2  # of rollouts in batches, see `bayes.lanes.STEP`
+PRIOR_DRAWS = 200  # for these deviations
+NOISE_DIFFERENCE = 1e-4  # of noise coordinates, which are logarithms
 
 UNBOUNDED = (-np.inf, np.inf)
 
@@ -150,7 +153,8 @@ def _make_linearise(
 
     jacobian = problem.jacobian
     in_batches = problem.residual_batch if jacobian == "central" and isinstance(problem, BatchedResiduals) else None
-    width = BATCH_DIFFERENCE if in_batches else DIFFERENCE
+    drawn = problem.to_unconstrained(problem.sample_prior(jax.random.key(0), PRIOR_DRAWS))
+    width = (BATCH_DIFFERENCE if in_batches else DIFFERENCE) * np.asarray(drawn).std(axis=0)
     batched = None
     if in_batches is None and _works(lambda f, u: f(u), residuals, u):
         batched = jax.jit(jax.vmap(residuals))
@@ -169,7 +173,7 @@ def _make_linearise(
         return values[0], 0.5 * (upper - lower).T
 
     def central(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        residual, changes = differences(u, width * np.eye(len(u)))
+        residual, changes = differences(u, np.diag(width))
         return residual, changes / width
 
     @jax.jit
@@ -218,10 +222,10 @@ def _known(jacobian: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d"]:
 
 
 def _slope(likelihood: Callable, u: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    steps = DIFFERENCE * np.eye(len(u))[chosen]
+    steps = NOISE_DIFFERENCE * np.eye(len(u))[chosen]
     values = likelihood(np.concatenate([u + steps, u - steps]))
     upper, lower = values[: len(steps)], values[len(steps) :]
-    return (upper - lower) / (2.0 * DIFFERENCE)
+    return (upper - lower) / (2.0 * NOISE_DIFFERENCE)
 
 
 def _noise_hessian(likelihood: Callable, u: np.ndarray, noise: np.ndarray) -> np.ndarray:
