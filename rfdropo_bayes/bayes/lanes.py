@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Self
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +22,10 @@ from rfdropo_bayes.simulators.protocol import Simulator
 # Lanes of one call of an audit: a compilation costs more than the padding of a call, so that there is one size. Calls
 # with few different lanes are the most frequent.
 WIDTH = 8 * max(available_processors(), 2)
-# Step of a derivative of a compiled engine in prior deviations, one-sided; a larger step is taken to both sides. Cables
-# that fall slack make kinks: over a step of 1e-4, which moves markers by micrometres, effects of single cables have
-# cosines of .1 to .9 with those of a visible size, over 1e-2 of .95 to 1 (smooth arm, three data sets).
+# Step of a derivative of a compiled engine to both sides, in prior deviations. Cables that fall slack make kinks: over
+# a step of 1e-4, which moves markers by micrometres, effects of single cables have cosines of .1 to .9 with those of a
+# visible size, over 1e-2 of .95 to 1 (smooth arm, three data sets). To one side, the shift of a clock has .75, as
+# commands change at the times of rows.
 STEP = 1e-2
 COARSE = 0.03  # the same for an engine in single precision, whose rounding is 1e-5 m
 
@@ -95,20 +95,12 @@ class Lanes:
     @property
     def slope_rollouts(self) -> int:
         """Rollouts per derivative, beside those of the value."""
-        if self.difference is None:
-            return 3
-        return 1 if self.difference <= STEP else 2
+        return 3 if self.difference is None else 2
 
     @property
     def later(self) -> float:
         """Time to compile what only rollouts with candidates need, in times that the first program takes."""
         return 0.0
-
-    def with_difference(self, step: float) -> Self:
-        """The lanes with another step of differences."""
-        changed = copy.copy(self)
-        changed.difference = step
-        return changed
 
     @cached_property
     def _rolled(self) -> Any:

@@ -6,13 +6,12 @@ import copy
 import time
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
-from rfdropo_bayes.bayes.lanes import STEP, Fields, Lanes
+from rfdropo_bayes.bayes.lanes import Fields, Lanes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.journal import digest
@@ -89,18 +88,11 @@ class Forward:
             *map(np.asarray, self.commands[:4]),
         )
 
-    def with_difference(self, step: float) -> Forward:
-        """The forward model with another step of derivatives."""
-        return self._with(lanes=self.lanes.with_difference(step))
-
     def with_coordinates(self, coordinates: Coordinates) -> Forward:
         """The forward model in other coordinates of the same parameters."""
-        return self._with(coordinates=coordinates)
-
-    def _with(self, **parts: Any) -> Forward:
         changed = copy.copy(self)
         changed.__dict__.pop("identity", None)
-        changed.__dict__.update(parts)
+        changed.coordinates = coordinates
         changed.forget()
         return changed
 
@@ -186,14 +178,11 @@ class Forward:
         return shown
 
     def _differences(self, points: Points, directions: Points, step: float) -> Fields:
-        """Differences over a step in prior deviations: to one side if it is small, and at bounds; zero if a rollout
-        fails.
-        """
+        """Differences over a step in prior deviations to both sides, at bounds to one; zero if a rollout fails."""
         low, high = self.coordinates.bounds
         size = step / np.maximum(np.abs(directions / self.coordinates.prior_sd).max(axis=1), np.finfo(float).tiny)
         move = size[:, None] * directions
         ahead, behind = (((x >= low) & (x <= high)).all(axis=1) for x in (points + move, points - move))
-        behind &= ~ahead | (step > STEP)
         ends = np.concatenate([points - behind[:, None] * move, points + ahead[:, None] * move])
         seen, fine = self.observe(ends)
         usable = fine.reshape(2, -1).all(axis=0) & (ahead | behind)
