@@ -14,20 +14,19 @@ and no further rollouts are needed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
+from numpyro.distributions import Distribution, MultivariateNormal, MultivariateStudentT
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal, multivariate_t
 
 from rfdropo_bayes.bayes.problem import Problem
 from rfdropo_bayes.cautions import Caution, Code
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.mixture import draw_mixture, shares
 from rfdropo_bayes.inference.modes.optimisation import Laplace
-from rfdropo_bayes.inference.smc.moves import host_generator
 
 CANDIDATE_SHARE = 0.25  # of a budget that optimisations leave to candidates
 FEWEST_CANDIDATES = 20
@@ -67,15 +66,17 @@ def reweighted(
     if candidates < FEWEST_CANDIDATES:
         return None
     draw_key, order_key = jax.random.split(key)
-    generator = host_generator(draw_key)
-    sources = [[multivariate_normal(mode.mean, mode.covariance) for mode in modes]]
+    # By Cholesky factors: sizes of a law in metres have variances of 1e-11 beside 1 of others, and are no less known.
+    normals = [MultivariateNormal(mode.mean, scale_tril=np.linalg.cholesky(mode.covariance)) for mode in modes]
+    sources: list[Sequence[Distribution]] = [normals]
     u, rows, posterior = np.empty((0, len(modes[0].mean))), np.empty((0, problem.n_rows)), np.empty(0)
     for widened, size in _batches(candidates):
         if widened:
             by_mode = _weights(posterior, sources, u)
             sources.append([_widened(mode, u, by_mode[:, k]) for k, mode in enumerate(modes)])
-        sizes = zip(sources[-1], shares(len(modes), size), strict=True)
-        drawn = [np.reshape(source.rvs(int(n), random_state=generator), (n, -1)) for source, n in sizes if n]
+        own_keys = jax.random.split(jax.random.fold_in(draw_key, len(u)), len(modes))
+        sizes = zip(sources[-1], own_keys, shares(len(modes), size), strict=True)
+        drawn = [np.asarray(source.sample(own, (int(n),))) for source, own, n in sizes]
         more_rows, more = _exact(problem, np.concatenate(drawn), ledger)
         u, rows = np.concatenate([u, *drawn]), np.concatenate([rows, more_rows])
         posterior = np.concatenate([posterior, more])
@@ -120,23 +121,23 @@ def _exact(
 
 
 def _weights(
-    posterior: Float[np.ndarray, " n"], sources: Sequence[Sequence[Any]], u: Float[np.ndarray, "n d"]
+    posterior: Float[np.ndarray, " n"], sources: Sequence[Sequence[Distribution]], u: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "n mode"]:
     """``p / q`` times the share of each mode in ``q``, the largest of them 1; zero throughout if ``p`` is."""
-    each = np.array([[source.logpdf(u) for source in of_round] for of_round in sources])
+    each = np.array([[np.asarray(source.log_prob(u)) for source in of_round] for of_round in sources])
     with np.errstate(divide="ignore"):
         parts = logsumexp(np.reshape(each, (len(sources), len(sources[0]), -1)), axis=0).T - np.log(len(sources[0]))
     logs = posterior[:, None] + parts - 2.0 * logsumexp(parts, axis=1, keepdims=True)
     return np.exp(logs - logs.max()) if np.isfinite(logs).any() else np.zeros_like(logs)
 
 
-def _widened(mode: Laplace, u: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Any:
+def _widened(mode: Laplace, u: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"]) -> Distribution:
     """Student-t around the weighted mean; around the mode if nothing has a weight."""
-    if weight.sum() == 0.0:
-        return multivariate_t(mode.mean, 2.0 * mode.covariance, DEGREES)
-    mean = weight @ u / weight.sum()
-    covariance = (weight * (u - mean).T) @ (u - mean) / weight.sum()
-    return multivariate_t(mean, covariance + mode.covariance, DEGREES)
+    mean, covariance = mode.mean, mode.covariance
+    if weight.sum() > 0.0:
+        mean = weight @ u / weight.sum()
+        covariance = (weight * (u - mean).T) @ (u - mean) / weight.sum()
+    return MultivariateStudentT(DEGREES, mean, np.linalg.cholesky(covariance + mode.covariance))
 
 
 def _systematic(weight: Float[np.ndarray, " n"], count: int, key: PRNGKeyArray) -> Int[np.ndarray, " draw"]:
