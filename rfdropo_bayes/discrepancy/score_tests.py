@@ -19,12 +19,11 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.candidates import Probe
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.discrepancy.omnibus import Omnibus, block_squares, joint_test, statistics
+from rfdropo_bayes.discrepancy.omnibus import DIRECTED, Omnibus, block_squares, joint_test, statistics
 from rfdropo_bayes.discrepancy.score import project_out, span, statistic
 from rfdropo_bayes.discrepancy.unknown_size import linear_evidence
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
-DIRECTED = "candidates"
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from rfdropo_bayes.discrepancy.gain import (
     explained_fraction,
     sign_flip_p,
 )
-from rfdropo_bayes.discrepancy.omnibus import joint_test, statistics
+from rfdropo_bayes.discrepancy.omnibus import DIRECTED, joint_test, statistics
 from rfdropo_bayes.discrepancy.score import (
     Signature,
     joint_statistic,
@@ -352,17 +352,32 @@ def test_recordings_that_all_favour_one_model_support_it_however_much_they_diffe
     assert abs(level - 0.05) < 5.0 * np.sqrt(0.05 * 0.95 / 400)
 
 
-def test_a_joint_p_value_is_reached_no_more_often_than_it_says():
+@pytest.mark.parametrize("names", ["abcde", ("a", "b", "c", "d", DIRECTED)])
+def test_a_joint_p_value_is_reached_no_more_often_than_it_says(names):
     """Five independent statistics against 199 simulated ones each: the least p-value comes in one case of 200, and not
     in five of 200. 1000 data sets, five deviations."""
-    rng = np.random.default_rng(1)
-    names, found = "abcde", []
+    rng, found = np.random.default_rng(1), []
     for _ in range(1000):
         drawn = rng.standard_normal((5, 200))
         simulated = {name: row[1:] for name, row in zip(names, drawn, strict=True)}
         found.append(joint_test({n: float(r[0]) for n, r in zip(names, drawn, strict=True)}, simulated, np.ones(1)).p)
     for level in (0.005, 0.01, 0.05):
         assert np.mean(np.array(found) <= level) <= level + 5.0 * np.sqrt(level / 1000)
+
+
+def test_candidates_count_as_much_as_all_other_statistics_together():
+    """A score in the upper .4 %, beside five other statistics of no note: half of the joint test's level is the
+    candidates', a sixth of it another statistic's."""
+    rng, names = np.random.default_rng(3), ("a", "b", "c", "d", "e", DIRECTED)
+    simulated = {name: rng.standard_normal(1999) for name in names}
+
+    def p(high: str) -> float:
+        observed = dict.fromkeys(names, 0.0)
+        observed[high] = float(np.quantile(simulated[high], 0.996))
+        return joint_test(observed, simulated, np.ones(1)).p
+
+    assert p(DIRECTED) == pytest.approx(0.009, rel=0.1)
+    assert p("a") == pytest.approx(0.045, rel=0.2)
 
 
 def test_two_candidates_that_pay_only_together_are_seen_together():
