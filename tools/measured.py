@@ -56,9 +56,11 @@ def days() -> dict[str, dict[float, Mapping[str, Any]]]:
     return found
 
 
-def audits(ledger: str) -> dict[str, Mapping[str, Any]]:
-    """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``)."""
-    lines = read_lines(REPORTS / ledger)
+def audits(ledger: str, seed: int | None = None) -> dict[str, Mapping[str, Any]]:
+    """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``); of one
+    seed if it is given.
+    """
+    lines = [line for line in read_lines(REPORTS / ledger) if seed in (None, line["job"]["seed"])]
     right: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
         "null": lambda result: result["verdict"] == "no_discrepancy",
         "removed": lambda result: result["verdict"] not in ("explained", "equivalent"),
@@ -143,6 +145,7 @@ def page() -> str:
         asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
         motion=audits("audit_power/unknown_scale/datasets.jsonl"),
+        today=audits("audit_power/visible_steps/datasets.jsonl", seed=5008),
         laws=laws(),
         sizes=sizes(),
         inferred=table1("rod"),
