@@ -225,7 +225,7 @@ class Ratio(LinearGaussian):
 
     def to_unconstrained(self, values):
         x = together(values, self.names)
-        with np.errstate(invalid="ignore"):  # beyond a bound there is no coordinate
+        with np.errstate(divide="ignore", invalid="ignore"):  # at a bound and beyond it there is no coordinate
             return kind(x).log((x - self.low) / (self.high - x))
 
     def from_unconstrained(self, u):
