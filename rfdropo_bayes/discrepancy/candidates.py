@@ -106,8 +106,10 @@ def probe_all(target: FitTarget, fit: Fit, candidates: Sequence[Candidate]) -> l
     indices = [i for c in open_ for i in c.indices]
     at_null = np.zeros((len(fit.residual), 0))
     if indices:
-        chosen = np.array(indices, dtype=int)
-        at_null = target.recall("null", [fit.x, chosen], lambda: {"slopes": target.jacobian(fit.x, chosen)})["slopes"]
+        points, directions = np.repeat(fit.x[None], len(indices), axis=0), np.eye(len(fit.x))[indices]
+        at_null = target.recall(
+            "null", [points, directions], lambda: {"slopes": target.visible_slopes(points, directions)}
+        )["slopes"].T
     column = dict(zip(indices, at_null.T, strict=True))
     jobs: list[tuple[Candidate, dict[int, float]]] = []
     probes: list[Probe] = []
@@ -142,7 +144,7 @@ def score_test_rollouts(target: FitTarget, candidates: Sequence[Candidate]) -> i
         own = [parameters[i] for i in candidate.indices]
         touched = sum(any(p.holds_for(name) for p in own) for name in target.measurements.names)
         shapes = [len(p.spec.grid) for p in own if p.spec.grid]
-        rollouts += touched * (forward.lanes.slope_rollouts * len(own) + int(np.prod(shapes)) * bool(shapes))
+        rollouts += touched * ((forward.lanes.slope_rollouts + 2) * len(own) + int(np.prod(shapes)) * bool(shapes))
     return rollouts
 
 
@@ -162,7 +164,7 @@ def _probe_grid(
     rows = np.array([row for row, _ in slots], dtype=int)
     directions = np.eye(points.shape[1])[[i for _, i in slots]] if slots else np.zeros((0, points.shape[1]))
     slopes = target.recall(
-        "slopes", [points[rows], directions], lambda: {"slopes": target.slopes(points[rows], directions)[0]}
+        "slopes", [points[rows], directions], lambda: {"slopes": target.visible_slopes(points[rows], directions)}
     )
     probes = []
     for row, (candidate, point) in enumerate(jobs):

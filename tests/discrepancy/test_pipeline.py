@@ -441,6 +441,27 @@ def test_differences_of_rollouts_are_the_derivatives(step):
     np.testing.assert_allclose(found, exact, atol=1e-4 * np.abs(exact).max())
 
 
+def test_slopes_that_show_pass_over_a_kink():
+    """Within a millionth of null the effect goes the other way, which no measurement shows."""
+
+    class Kinked(Toy):
+        def rollout(self, parameters, commands, steps=None):
+            play = parameters["play"]
+            return super().rollout({**parameters, "play": play - 2.0 * jnp.clip(play, -1e-6, 1e-6)}, commands, steps)
+
+    asked = problem(TRUTH, 1)
+    straight = first_target(asked, Journal())
+    kinked = first_target(replace(asked, lanes=Lanes(Kinked(), np.arange(4))), Journal())
+    points = straight.forward.coordinates.encode(TRUTH)[None]
+    direction = np.eye(points.shape[1])[[asked.coordinates.space.names.index("play")]]
+    slope = straight.slopes(points, direction)[0]
+    assert np.linalg.norm(slope) > 1.0
+    np.testing.assert_allclose(kinked.slopes(points, direction)[0], -slope, atol=1e-6 * np.abs(slope).max())
+    for target in (straight, kinked):
+        found = target.visible_slopes(points, direction)
+        np.testing.assert_allclose(found, slope, atol=1e-3 * np.abs(slope).max())
+
+
 @pytest.mark.slow
 def test_a_refit_finds_back_from_an_extrapolation_at_which_rollouts_fail(monkeypatch):
     """A large misfit makes the linear extrapolation a poor start; here no rollout ends well beyond a tenth of it."""

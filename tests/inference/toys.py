@@ -206,16 +206,17 @@ class TwoModes(LinearGaussian):
 
 
 class Ratio(LinearGaussian):
-    """Data see the ratio of a stiffness and a mass only, to 0.02 %; both priors are uniform, and end on the ridge."""
+    """Data see the ratio of a stiffness and a mass only, by default to 0.02 %; both priors are uniform, and end on the
+    ridge."""
 
     low, high = np.array([2.0, 0.005]), np.array([7.0, 1.0])
 
-    def __init__(self, truth: tuple[float, float] = (3.0, 0.9)) -> None:
+    def __init__(self, truth: tuple[float, float] = (3.0, 0.9), noise: float = 2e-3) -> None:
         super().__init__(n_rows=40, d=2)
         self.names = ("stiffness", "mass")
         self.units = dict.fromkeys(self.names, "1")
         self.bounds = {"stiffness": (2.0, 7.0), "mass": (0.005, 1.0)}
-        self.gain, self.noise = np.linspace(0.5, 2.0, 40), np.full(40, 2e-3)
+        self.gain, self.noise = np.linspace(0.5, 2.0, 40), np.full(40, noise)
         rng = np.random.default_rng(3)
         self.data = self.gain * np.log(truth[0] / truth[1]) + self.noise * rng.normal(size=40)
 

@@ -29,7 +29,7 @@ from rfdropo_bayes.inference.modes.optimisation import positive_part
 
 # Steps of central differences, in the prior's deviations of each unconstrained coordinate, which may be metres.
 DIFFERENCE = 1e-4
-BATCH_DIFFERENCE = 1e-2  # of rollouts in batches, see `bayes.lanes.STEP`
+BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
 PRIOR_DRAWS = 200  # for these deviations
 NOISE_DIFFERENCE = 1e-4  # of noise coordinates, which are logarithms
 
