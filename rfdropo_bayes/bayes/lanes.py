@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +23,9 @@ from rfdropo_bayes.simulators.protocol import Simulator
 # Lanes of one call of an audit: a compilation costs more than the padding of a call, so that there is one size. Calls
 # with few different lanes are the most frequent.
 WIDTH = 8 * max(available_processors(), 2)
-# Step of a derivative of a compiled engine to both sides, in prior deviations. A delay of .07 s is known to 4e-5 s: fits
-# with steps of 1e-2 (a millisecond) end 1.5e-4 s beside it, with 1e-3 and less within its deviation. The rounding of
-# 1e-13 m errs by 1e-9 m a deviation, the last iteration of an equilibrium by 1e-6 m.
+# Step of a derivative of a compiled engine to both sides, in prior deviations. A delay of .07 s is known to 4e-5 s, and
+# a fit with steps of 1e-2 (a millisecond) ends 1.5e-4 s beside it. Rounding of 1e-13 m errs by 1e-9 m a deviation, the
+# last iteration of an equilibrium by 1e-6 m.
 STEP = 1e-4
 COARSE = 0.03  # the same for an engine in single precision, whose rounding is 1e-5 m
 
@@ -100,6 +101,12 @@ class Lanes:
     def later(self) -> float:
         """Time to compile what only rollouts with candidates need, in times that the first program takes."""
         return 0.0
+
+    def with_difference(self, step: float) -> Self:
+        """The lanes with another step of differences."""
+        changed = copy.copy(self)
+        changed.difference = step
+        return changed
 
     @cached_property
     def _rolled(self) -> Any:

@@ -25,6 +25,7 @@ from rfdropo_bayes.discrepancy.fit import (
     optimise,
     optimum_rollouts,
     poll_rollouts,
+    with_usable_differences,
 )
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.journal import Journal
@@ -105,7 +106,10 @@ def base_fits(
     free = np.arange(coordinates.base)
     first = base_optimum(target, jax.random.key(seed)) if problem.start is None else begun.x
     yield Reached(target, first)
-    fit_target, fit = fit_with_noise(target, first, free)
+    smooth = with_usable_differences(target, first)
+    if smooth.forward.lanes.difference != target.forward.lanes.difference:
+        report(f"motion is rough: derivatives over relative steps of {smooth.forward.lanes.difference:g}")
+    fit_target, fit = fit_with_noise(smooth, first, free)
     for _ in range(AGAIN):
         yield Reached.at(fit_target, replace(fit, promise=np.inf))
         better = better_nearby(fit_target, fit)

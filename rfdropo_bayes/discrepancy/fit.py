@@ -33,6 +33,7 @@ from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, find_modes
 from rfdropo_bayes.inference.modes.optimisation import maximise, normal_at, optimisation_cost
 from rfdropo_bayes.inference.modes.targets import Target as Climbed
+from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
 ALL = 40  # most steps of a full optimisation
@@ -540,6 +541,27 @@ def optimum_rollouts(target: FitTarget) -> int:
 def poll_rollouts(target: FitTarget) -> int:
     """Rollouts that `better_nearby` takes."""
     return target.forward.count * (1 + 2 * (len(POLLED) + len(ALONG)) * target.forward.coordinates.base)
+
+
+def with_usable_differences(target: FitTarget, x: Float[np.ndarray, " d"]) -> FitTarget:
+    """The target with derivatives over steps on whose scale its motion is smooth around a point.
+
+    Slopes over the steps of a ladder, in prior deviations, are compared, of all base parameters at once; rollouts say
+    which steps agree.
+    """
+    usual, coordinates = target.forward.lanes.difference, target.forward.coordinates
+    if usual is None:
+        return target
+    directions = np.diag(coordinates.prior_sd)[: coordinates.base]
+
+    def slope(step: float) -> np.ndarray:
+        points = np.clip(np.concatenate([x + step * directions, x - step * directions]), *coordinates.bounds)
+        residuals = target.recall("ladder", [points], lambda: {"residual": target.residual(points)})["residual"]
+        ahead, behind = np.split(residuals, 2)
+        return (ahead - behind) / (2.0 * step)
+
+    step = usable_difference(slope)
+    return target if step <= usual else replace(target, forward=target.forward.with_difference(step))
 
 
 def better_nearby(target: FitTarget, fit: Fit) -> Float[np.ndarray, " d"] | None:

@@ -6,6 +6,7 @@ import copy
 import time
 from collections.abc import Mapping
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -88,11 +89,18 @@ class Forward:
             *map(np.asarray, self.commands[:4]),
         )
 
+    def with_difference(self, step: float) -> Forward:
+        """The forward model with another step of derivatives."""
+        return self._with(lanes=self.lanes.with_difference(step))
+
     def with_coordinates(self, coordinates: Coordinates) -> Forward:
         """The forward model in other coordinates of the same parameters."""
+        return self._with(coordinates=coordinates)
+
+    def _with(self, **parts: Any) -> Forward:
         changed = copy.copy(self)
         changed.__dict__.pop("identity", None)
-        changed.coordinates = coordinates
+        changed.__dict__.update(parts)
         changed.forget()
         return changed
 

@@ -264,7 +264,11 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
             results = replace(results, reached=reached)
             yield results
     target, base = results.reached.settled()
-    problem, results = begun.problem, results.after(BASE)
+    problem, step = begun.problem, target.forward.lanes.difference
+    if step is not None and step != problem.lanes.difference:  # steps that the base fit has found usable
+        finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
+        problem = replace(problem, lanes=target.forward.lanes, finer=finer)
+    results = replace(results, problem=problem).after(BASE)
     report(f"base model fitted; {_noise_in_words(target, base)}")
     firsts = [group[0] for group in target.measurements.members]
     refined = simulated(problem, True, target.measurements, firsts, clock) if problem.finer else None

@@ -230,6 +230,10 @@ class PortedForward(Forward):
         """The same laws on other rollouts, as of other recordings or of a finer simulator."""
         return PortedForward(forward, self.ports, table, self.terms)
 
+    def with_difference(self, step: float) -> Forward:
+        """See `Forward.with_difference`."""
+        return self.instead_of(self.plain.with_difference(step), self.table)
+
     @property
     def _difference(self) -> float:
         """See `Lanes.difference`; JAX does not see the signals."""

@@ -3,7 +3,6 @@ seed in twenty or fewer, those on several as stated."""
 
 from __future__ import annotations
 
-import copy
 import json
 import re
 from dataclasses import replace
@@ -428,11 +427,8 @@ def test_rollouts_go_to_the_simulator_that_knows_their_candidates():
 @pytest.mark.parametrize("step", [1e-4, 0.03])
 def test_differences_of_rollouts_are_the_derivatives(step):
     """To both sides, and at a bound to the side within; the motion is almost linear there."""
-    given = problem(TRUTH, 1)
-    forward = first_target(given, Journal()).forward
-    lanes = copy.copy(given.lanes)
-    lanes.difference = step
-    by_step = first_target(replace(given, lanes=lanes), Journal()).forward
+    forward = first_target(problem(TRUTH, 1), Journal()).forward
+    by_step = forward.with_difference(step)
     points = np.repeat(forward.coordinates.encode(TRUTH)[None], 3, axis=0)
     points[2, 0] = forward.coordinates.bounds[1][0]
     directions = np.eye(points.shape[1])[[0, 1, 0]]
