@@ -30,6 +30,7 @@ from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
+from rfdropo_bayes.discrepancy.score import VISIBLE
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, find_modes
 from rfdropo_bayes.inference.modes.optimisation import maximise, normal_at, optimisation_cost
 from rfdropo_bayes.inference.modes.targets import Target as Climbed
@@ -234,8 +235,8 @@ class FitTarget:
     def visible_slopes(
         self, points: Float[np.ndarray, "k d"], directions: Float[np.ndarray, "k d"]
     ) -> Float[np.ndarray, "k m"]:
-        """Slopes of the whitened prediction over changes that just show, of norm 1, to both sides within the bounds;
-        plain slopes where a change by the whole direction does not show, or a rollout fails.
+        """Slopes of the whitened prediction over changes that just show (`VISIBLE`), to both sides within the bounds;
+        plain slopes if a change by the whole direction does not show, or a rollout fails.
 
         Cables that fall slack make kinks. Over micrometres, effects of single cables have cosines of .1 to .9 with
         those that show (smooth arm, three data sets); to one side, the shift of a clock has .75, as commands change at
@@ -243,16 +244,16 @@ class FitTarget:
         """
         slopes = self.slopes(points, directions)[0]
         size = np.linalg.norm(slopes, axis=1)
-        seen = size > 1.0
+        seen = size > VISIBLE
         if not seen.any():
             return slopes
-        change = directions[seen] / size[seen, None]
+        change = VISIBLE * directions[seen] / size[seen, None]
         ends = [np.clip(points[seen] + sign * change, *self.forward.coordinates.bounds) for sign in (1.0, -1.0)]
         both = self.residual(np.concatenate(ends))
         ahead, behind = np.split(both, 2)
         share = np.sum((ends[0] - ends[1]) * directions[seen], axis=1) / np.sum(directions[seen] ** 2, axis=1)
         fine = np.all(np.abs(both) < FAILED, axis=1).reshape(2, -1).all(axis=0) & (share > 0.0)
-        slopes[np.flatnonzero(seen)[fine]] = ((behind - ahead)[fine].T / share[fine]).T
+        slopes[np.flatnonzero(seen)[fine]] = (behind - ahead)[fine] / share[fine, None]
         return slopes
 
     def jacobian(self, x: Float[np.ndarray, " d"], free: Int[np.ndarray, " free"]) -> Float[np.ndarray, "m free"]:
