@@ -168,7 +168,13 @@ class RobotOutline:
     @property
     def arm(self) -> float:
         """Distance of the cables at the base, or of the chambers, from the axis [m]."""
-        return CABLES_AT * self.radius if self.cable_radius is None else self.cable_radius
+        return CABLES_AT * self.inside if self.cable_radius is None else self.cable_radius
+
+    @property
+    def inside(self) -> float:
+        """Radius of the body at the base [m], or if chambers run straight through it, where it is narrowest."""
+        tip = self.radius if self.tip_radius is None else self.tip_radius
+        return min(self.radius, tip) if self.command_unit == "Pa" else self.radius
 
     @property
     def bending_force(self) -> float:
@@ -231,7 +237,7 @@ class RobotOutline:
     @property
     def chamber_area(self) -> float:
         """Area of a chamber across the axis [m2], assumed."""
-        return np.pi * (CHAMBER_RADIUS * self.radius) ** 2
+        return np.pi * (CHAMBER_RADIUS * self.inside) ** 2
 
     @property
     def newtons(self) -> float:
@@ -361,9 +367,9 @@ def _cables(o: RobotOutline) -> list[str]:
             f'name = "{names[row]}"',
             f"azimuth_deg = {azimuth:g}",
             "anchor_z_m = 0.0",
-            f"anchor_radius_m = {o.arm:.6g}",
-            f"guide_z_m = {_toml([round(float(z), 6) for z in heights[inside]])}",
-            f"guide_radius_m = {_toml([round(float(r), 6) for r in radius[inside]])}",
+            f"anchor_radius_m = {_toml(o.arm)}",
+            f"guide_z_m = {_toml(heights[inside].tolist())}",
+            f"guide_radius_m = {_toml(radius[inside].tolist())}",
             *_limits(o),
             "",
         ]
@@ -384,8 +390,8 @@ def _chambers(o: RobotOutline) -> list[str]:
             "[[chambers]]",
             f'name = "{names[row]}"',
             f"azimuth_deg = {360.0 / o.cables * chamber + o.first_azimuths()[segment]:g}",
-            f"radius_m = {o.arm:.6g}",
-            f"z_m = [{ends[segment]:.6g}, {ends[segment + 1]:.6g}]",
+            f"radius_m = {_toml(o.arm)}",
+            f"z_m = {_toml(list(ends[segment : segment + 2]))}",
             f"area_m2 = {o.chamber_area:.6g}",
             f"pressure_limit_pa = [{VACUUM:g}, {FORCE_LIMIT * usual:.6g}]  # ASSUMED",
             "",
@@ -404,7 +410,7 @@ def _limits(o: RobotOutline) -> list[str]:
 def _markers(o: RobotOutline) -> list[str]:
     lines = ["# Measured points in the undeformed body: x, y, z." + _mark(o, "markers")]
     for name, height in o.markers.items():
-        lines += ["[[markers]]", f'name = "{name}"', f"point_m = [0.0, 0.0, {height:.6g}]", ""]
+        lines += ["[[markers]]", f'name = "{name}"', f"point_m = [0.0, 0.0, {_toml(float(height))}]", ""]
     return lines
 
 

@@ -6,6 +6,8 @@ import inspect
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
@@ -69,6 +71,16 @@ def test_every_outline_is_a_robot(tmp_path, answers):
     for cable, guides in zip(robot.cables, robot.guides(), strict=True):
         segment = robot.cables.index(cable) // outline.cables
         assert guides[-1, 2] == pytest.approx(0.3 * (segment + 1) / outline.segments, abs=0.002)
+
+
+@given(length=st.floats(0.1, 3.0), shape=st.sampled_from(["cone", "disks"]), unit=st.sampled_from(["m", "Pa"]))
+@settings(max_examples=30, deadline=None)
+def test_sizes_of_any_digits_make_a_robot(length, shape, unit):
+    """Lengths in inches have more digits than a file of six; the last guide lies no higher than the body."""
+    sizes = {"tip_radius": 0.02 * length} if shape == "cone" else {"inner_radius": 0.01 * length}
+    answers = {"length": length, "radius": 0.05 * length, "shape": shape, "command_unit": unit, **sizes}
+    robot = Robot.outline(name="arm", markers={"tip": length}, segments=3, cables=3, **answers)
+    assert robot.marker_points()[-1, 2] == pytest.approx(length, rel=1e-8)
 
 
 def test_pairs_pull_and_let_out(tmp_path):
