@@ -3,7 +3,8 @@
 It is given, or measured, or recognised from how the recording begins. Measured motor angles show the first command.
 Without them, either the first command was in force already, so that the robot rests until commands change, or no
 command was, and the robot starts from its rest pose. A linear robot with a dead time and a lag is fitted for both
-cases; the case with the smaller error in the first rows is taken.
+cases; the case with the smaller error in the first rows is taken. Recordings that do not decide begin as the others of
+their experiment do.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ MEMORY = "memory"  # the format of recordings from arrays
 UNTOLD = ("asl-csv", "csv", "motive-csv", "rosbag", "lerobot", MEMORY)
 """Formats that do not state the command before their first row."""
 
+UNDECIDED: Literal["undecided"] = "undecided"  # the first command is then taken to have been in force
 MEASURED = {"rule": "measured", "why": "the motors' angles in the first row"}
 
 
@@ -70,8 +72,7 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
                 remedy=f"give one for each of {', '.join(channels)}",
             )
         return trajectory.with_initial_command(np.asarray(rule, dtype=float), {"rule": "given", "why": why})
-    first = trajectory.command[0]
-    return trajectory.with_initial_command(first if rule == "first" else 0.0 * first, {"rule": rule, "why": why})
+    return trajectory.with_initial_command(_command(trajectory, rule), {"rule": rule, "why": why})
 
 
 def angle_at_first(trajectory: Trajectory) -> Float[np.ndarray, " channel"] | None:
@@ -86,27 +87,56 @@ def angle_at_first(trajectory: Trajectory) -> Float[np.ndarray, " channel"] | No
     return np.asarray(angle[0]) if held or mask is None or mask[0].all() else None
 
 
-def common_beginning(trajectories: Sequence[Trajectory]) -> str | None:
-    """The rule by which all of some recordings begin, "first" or "zero"; None if they differ or need no rule."""
-    rules = {trajectory.settings.get(FIRST_COMMAND, {}).get("rule") for trajectory in trajectories}
-    rule = rules.pop() if len(rules) == 1 else None
-    return rule if rule in ("first", "zero") else None
+def common_beginning(trajectories: Sequence[Trajectory]) -> Literal["first", "zero"] | None:
+    """The rule by which all of some recordings begin that decide; None if none does, they differ or need no rule."""
+    rules = {_rule(trajectory) for trajectory in trajectories} - {UNDECIDED}
+    return "first" if rules == {"first"} else "zero" if rules == {"zero"} else None
+
+
+def begun_alike(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
+    """Recordings of one experiment; those that do not decide how they begin do so as the others, if these agree."""
+    rule = common_beginning(trajectories)
+    if rule is None:
+        return list(trajectories)
+    alike = {"rule": rule, "why": "as the other recordings begin; its own first rows do not decide"}
+    return [
+        trajectory.with_initial_command(_command(trajectory, rule), alike)
+        if undecided(trajectory)
+        else trajectory
+        for trajectory in trajectories
+    ]
+
+
+def undecided(trajectory: Trajectory) -> bool:
+    """Whether the command before the first row matters and was assumed."""
+    return _rule(trajectory) == UNDECIDED and bool(np.any(trajectory.command[0]))
+
+
+def _rule(trajectory: Trajectory) -> str | None:
+    """How the command before the first row is known; None if the file has it."""
+    rule = trajectory.settings.get(FIRST_COMMAND, {}).get("rule")
+    return None if rule is None else str(rule)
+
+
+def _command(trajectory: Trajectory, rule: str) -> Float[np.ndarray, " channel"]:
+    """The command before the first row by a rule."""
+    return (0.0 if rule == "zero" else 1.0) * trajectory.command[0]
 
 
 class Beginning(NamedTuple):
-    """Which command was in force before the first row, "first" or "zero", and how that is known."""
+    """Which command was in force before the first row, "first", "zero" or `UNDECIDED`, and how that is known."""
 
-    rule: Literal["first", "zero"]
+    rule: Literal["first", "zero", "undecided"]
     why: str
 
 
 def recognised(trajectory: Trajectory) -> Beginning:
-    """Which command was in force before the first row, from the motion in the first rows; "first" if undecided."""
+    """Which command was in force before the first row, from the motion in the first rows."""
     if not np.any(trajectory.command[0]):
-        return Beginning("first", "the first command is zero")
+        return Beginning(UNDECIDED, "the first command is zero")
     errors = beginning_errors(trajectory)
     if errors is None:
-        return Beginning("first", "assumed: the first rows do not decide")
+        return Beginning(UNDECIDED, "assumed: the first rows do not decide")
     first, zero = 1e3 * errors["first"], 1e3 * errors["zero"]
     evidence = (
         f"the first rows differ by {first:.2g} mm from a start at the first command, by {zero:.2g} mm from one at zero"
@@ -115,7 +145,7 @@ def recognised(trajectory: Trajectory) -> Beginning:
         return Beginning("zero", f"recognised: {evidence}")
     if first < CLEARLY * zero:
         return Beginning("first", f"recognised: {evidence}")
-    return Beginning("first", f"assumed: {evidence}, which does not decide")
+    return Beginning(UNDECIDED, f"assumed: {evidence}, which does not decide")
 
 
 def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:

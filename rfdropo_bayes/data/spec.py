@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from rfdropo_bayes.data import lerobot
 from rfdropo_bayes.data.asl_csv import NO_COMMANDS, read_asl_csv
-from rfdropo_bayes.data.first_command import begun_from
+from rfdropo_bayes.data.first_command import begun_alike, begun_from, undecided
 from rfdropo_bayes.data.mapped_formats import FOLDERS, MAPPED, read_mapped
 from rfdropo_bayes.data.named_columns import ROWS, CsvColumns
 from rfdropo_bayes.data.optitrack_csv import read_optitrack_csv
@@ -132,6 +132,11 @@ class _Source(NamedTuple):
         """Identity of the recording, regardless of rows."""
         return self.observations.resolve(), self.episode
 
+    @property
+    def key(self) -> tuple[Path, int | None, Path | None, str]:
+        """Identity of what is read: the recording, its commands, and the command before them."""
+        return self.observations, self.episode, self.commands, str(self.initial_command)
+
     def shares_rows(self, other: _Source) -> bool:
         """Whether a row belongs to both, parts of the same recording."""
         first, last = self.rows or (0, sys.maxsize - 1)
@@ -160,15 +165,16 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
     sources = fit if role == "fit" else test
     _check_split(fit, test)
     loaded: dict[tuple[Path, int | None, Path | None, str], Trajectory] = {}
+    for source in (*sources, *fit, *test):
+        if source.key not in loaded and (source in sources or any(map(undecided, loaded.values()))):
+            loaded[source.key] = begun_from(_read(spec, source), source.initial_command)
+    begun = dict(zip(loaded, begun_alike(list(loaded.values())), strict=True))
+    for key in dict.fromkeys(source.key for source in sources):
+        said = begun[key].name, begun[key].first_command
+        logging.getLogger(__name__).info("%s: command before the first row: %s", *said)
     recordings = []
     for source in sources:
-        rule = spec.initial_command if source.initial_command is None else source.initial_command
-        key = (source.observations, source.episode, source.commands, str(rule))
-        if key not in loaded:
-            loaded[key] = begun_from(_read(spec, source), rule)
-            said = loaded[key].name, loaded[key].first_command
-            logging.getLogger(__name__).info("%s: command before the first row: %s", *said)
-        recording = spec.piece(loaded[key], source.rows, source.every)
+        recording = spec.piece(begun[source.key], source.rows, source.every)
         recordings.append(recording if spec.resample is None else recording.resample(spec.resample))
     return _distinct_names(recordings, sources, [*fit, *test])
 
@@ -203,7 +209,8 @@ def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Itera
         for match in find_files(entry.observations, base, folders=spec.format in FOLDERS):
             zero = entry.commands == NO_COMMANDS
             for episode in _episodes(spec, entry, match):
-                yield _Source(match, commands, zero, entry.rows, entry.every, entry.initial_command, episode)
+                initial = spec.initial_command if entry.initial_command is None else entry.initial_command
+                yield _Source(match, commands, zero, entry.rows, entry.every, initial, episode)
 
 
 def _episodes(spec: DataSpec, entry: RecordingEntry, path: Path) -> list[int] | list[None]:
