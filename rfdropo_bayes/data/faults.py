@@ -9,7 +9,8 @@ Five kinds, each with its pattern in the numbers:
   its predecessor in all three coordinates is no new measurement. The first row of a held run counts as measured.
 - *jump*: the tracker fitted the wrong rigid body for a row or a short run of rows, and then came back; two markers that
   swap for a row jump both. A jump is a step that differs from the neighbouring steps by more than ``TOLERANCE +
-  MAX_ACCELERATION * dt**2``. The longest smooth path of each marker is kept: the largest set of rows in which every row
+  MAX_ACCELERATION * dt**2``, or than ``UNUSUAL`` times as much as half of the steps do: noise makes all steps differ.
+  The longest smooth path of each marker is kept: the largest set of rows in which every row
   can be reached from its predecessor. At most ``LONGEST_RUN`` rows are left out at a time, so a lasting change of level
   (a moved frame, an impact) is kept and counted among the *breaks*.
 - *renamed*: the place of a marker under the name of another (`identities`).
@@ -34,6 +35,7 @@ NOTES = "notes"  # key of a recording's settings: valid but suspicious facts
 
 TOLERANCE = 1.5e-3  # [m]
 MAX_ACCELERATION = 20.0  # [m/s2]: about 2 g, beyond the acceleration of the neighbouring rows
+UNUSUAL = 5.0  # times the median difference; of normal noise one step in 10^12 differs by so much
 LONGEST_RUN = 0.25  # [s]
 MOST_ROWS = 250  # of a run: the longest run at 1 kHz; motion capture is not faster, and memory grows with it
 FAR = 10e-3  # [m] from a zero to the marker before and after
@@ -231,7 +233,10 @@ def _off_path(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, int]:
         return wrong, breaks
     interval = float(np.median(np.diff(time)))
     reach = int(np.clip(round(LONGEST_RUN / interval), 2, MOST_ROWS))
-    motion = _Motion(time, position, *_end_velocities(time, position), interval)
+    velocities = _end_velocities(time, position)
+    noise = np.median(_Motion(time, position, *velocities, interval, 0.0).differences(1))
+    allowed = max(TOLERANCE + MAX_ACCELERATION * interval**2, UNUSUAL * float(noise))
+    motion = _Motion(time, position, *velocities, interval, allowed)
     rough = np.flatnonzero(~motion.smooth(1)) + 1
     for part in _around(rough, _MARGIN * reach, len(time)):
         wrong[part], broken = _longest_path(motion.part(part), reach)
@@ -246,13 +251,14 @@ def _around(rows: np.ndarray, margin: int, length: int) -> list[slice]:
 
 
 class _Motion(NamedTuple):
-    """Rows of one marker, with the velocities before and after each row."""
+    """Rows of one marker, with the velocities before and after each row, and how much a step may differ from them."""
 
     time: np.ndarray
     position: np.ndarray
     arriving: np.ndarray
     leaving: np.ndarray
     interval: float
+    allowed: float
 
     def part(self, rows: slice) -> _Motion:
         """Some rows of it."""
@@ -268,13 +274,18 @@ class _Motion(NamedTuple):
         gap = (self.time[last] - self.time[first])[:, None]
         step = self.position[last] - self.position[first]
         before, after = self.arriving[first], self.leaving[last]
-        allowed = TOLERANCE + MAX_ACCELERATION * self.interval**2
-        allowed = allowed * (1.0 + _DRIFT_PER_ROW * (gap[:, 0] / self.interval - 1.0).clip(0.0))
-        agrees = np.linalg.norm(step - gap * 0.5 * (before + after), axis=1) <= allowed
+        allowed = self.allowed * (1.0 + _DRIFT_PER_ROW * (gap[:, 0] / self.interval - 1.0).clip(0.0))
+        agrees = self.differences(apart) <= allowed
         if apart <= _ONSET_ROWS:
             for velocity in (before, after):
                 agrees |= np.linalg.norm(step - gap * velocity, axis=1) <= allowed
         return agrees
+
+    def differences(self, apart: int) -> Float[np.ndarray, " row"]:
+        """Distance of each step over ``apart`` rows from the mean of the velocities before and after it [m]."""
+        gap = (self.time[apart:] - self.time[:-apart])[:, None]
+        mean = 0.5 * (self.arriving[:-apart] + self.leaving[apart:])
+        return np.linalg.norm(self.position[apart:] - self.position[:-apart] - gap * mean, axis=1)
 
 
 def _longest_path(motion: _Motion, reach: int) -> tuple[np.ndarray, int]:

@@ -44,6 +44,16 @@ def test_every_single_row_jump_is_masked_and_nothing_else(jump):
     assert faults.counts["jump"] == [0, 0, len(rows)]
 
 
+@pytest.mark.parametrize("noise", [1e-3, 3e-3])
+def test_noise_is_no_jump_and_jumps_beyond_it_are_masked(noise):
+    """Trackers of other kinds than motion capture err by millimetres from row to row."""
+    time, position = swinging(noise=noise)
+    assert find_faults(time, position).mask.all()
+    rows = np.arange(40, 1460, 37)
+    position[rows, 2, 1] += 40.0 * noise
+    assert np.flatnonzero(~find_faults(time, position).mask[:, 2]).tolist() == rows.tolist()
+
+
 def test_short_runs_on_the_wrong_body_are_masked():
     time, position = swinging()
     wrong = np.r_[300:304, 500:510, 511:513, 900:908]
