@@ -36,7 +36,8 @@ class Rules:
         family: probability that the score tests name a candidate although the model is right.
         class_cosine: cosine above which signatures are one class.
         classes: number of leading classes to refit; members: total number of candidates to refit.
-        effects: most mechanisms added to a model that is not misspecified.
+        effects: number of mechanisms beyond which a further mechanism must take a significant share of the misfit away,
+            unless the model is misspecified.
         evidence: log Bayes factor required to add a mechanism. Later mechanisms need the logarithm of the number of
             candidates in addition, since a few of many candidates together imitate most effects. Candidates within this
             difference of the best are equivalent.
@@ -138,11 +139,16 @@ class ExtensionSearch:
         """A candidate by its name; None for `DISCRETISATION`."""
         return next((each for each in self.candidates if each.name == name), None)
 
-    def room(self, steps: int) -> int:
-        """Number of mechanisms that may still be added. A misspecified model may lack many, and down-weighted rows keep
-        out imitations.
+    def worthwhile(self, before: Fit, after: Fit, steps: int) -> bool:
+        """Whether the last of so many mechanisms may join. Many candidates together imitate most effects: beyond a few,
+        each must take a significant share of the misfit away. A misspecified model may lack many, and down-weighted
+        rows keep out imitations.
         """
-        return len(self.candidates) if self.target.known is not None else self.rules.effects - steps
+        if steps <= self.rules.effects or self.target.known is not None:
+            return True
+        left, taken = (float(fit.residual @ fit.residual) for fit in (before, after))
+        misfit = max(left - np.count_nonzero(before.residual), 0.0)
+        return left - taken > self.rules.significant * misfit > 0.0
 
     def score_tests(self, fit: Fit, without: Sequence[str] = ()) -> ScoreTests:
         """Test a fit and its missing candidates.

@@ -116,7 +116,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
             return
         first = tests.rows[0].name if tests.rows else "none"
         report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")
-        if named.asked.room(len(named.steps)) < 1 or p > rules.extended_passes:
+        if p > rules.extended_passes:
             return
         if frozenset(named.names) in extended:
             return
@@ -127,12 +127,12 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
                 yield named
             step = named.best
             pair = paying_pair(named.asked, tests, named.names, step)
-            if pair:
+            if pair and named.asked.worthwhile(named.fit, pair[-1].fit, len(named.steps) + 2):
                 named = named.extended([*named.steps, *pair])
                 yield named
                 named = with_simpler_steps(named)
                 continue
-            if step is None:
+            if step is None or not named.asked.worthwhile(named.fit, step.fit, len(named.steps) + 1):
                 return
             again = optimised_again(named.asked, step) if len(named.steps) not in renewed else None
             if again is not None:

@@ -40,8 +40,6 @@ def paying_pair(search: ExtensionSearch, tests: ScoreTests, named: Sequence[str]
         named: mechanisms in it.
         single: the best single mechanism; None without it.
     """
-    if search.room(len(named)) < 2:
-        return []
     fit, last, target = tests.fit, single.fit if single else tests.fit, search.target
     taken = float(fit.residual @ fit.residual - last.residual @ last.residual)
     if not misspecified(single.fit_target if single else target, last.x):
