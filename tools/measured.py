@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,11 +56,11 @@ def days() -> dict[str, dict[float, Mapping[str, Any]]]:
     return found
 
 
-def audits(ledger: str, seed: int | None = None) -> dict[str, Mapping[str, Any]]:
-    """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``); of one
-    seed if it is given.
+def audits(ledger: str, seeds: Sequence[int] = ()) -> dict[str, Mapping[str, Any]]:
+    """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``); of some
+    seeds if they are given.
     """
-    lines = [line for line in read_lines(REPORTS / ledger) if seed in (None, line["job"]["seed"])]
+    lines = [line for line in read_lines(REPORTS / ledger) if not seeds or line["job"]["seed"] in seeds]
     right: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
         "null": lambda result: result["verdict"] == "no_discrepancy",
         "removed": lambda result: result["verdict"] not in ("explained", "equivalent"),
@@ -145,7 +145,7 @@ def page() -> str:
         asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
         motion=audits("audit_power/unknown_scale/datasets.jsonl"),
-        today=audits("audit_power/visible_steps/datasets.jsonl", seed=5008),
+        today=audits("audit_power/visible_steps/datasets.jsonl", seeds=(5008, 5009)),
         laws=laws(),
         sizes=sizes(),
         inferred=table1("rod"),
