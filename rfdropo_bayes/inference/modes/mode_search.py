@@ -205,7 +205,7 @@ def starts_of_draws(
     draw = problem.sample_starts if isinstance(problem, WarmStart) else problem.sample_prior
     own, many = (
         np.asarray(problem.to_unconstrained(draw(each, number)), dtype=float)
-        for each, number in ((key, max(prior_draws, count)), (jax.random.fold_in(key, 1), FOR_MEDIANS))
+        for each, number in ((key, max(prior_draws, count, 2) - 1), (jax.random.fold_in(key, 1), FOR_MEDIANS))
     )
     u = np.concatenate([np.median(many, axis=0)[None], own])  # in many dimensions no draw comes near the middle
     density = _heights(problem, u, horizon, ledger)
