@@ -100,9 +100,7 @@ def begun_alike(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
         return list(trajectories)
     alike = {"rule": rule, "why": "as the other recordings begin; its own first rows do not decide"}
     return [
-        trajectory.with_initial_command(_command(trajectory, rule), alike)
-        if undecided(trajectory)
-        else trajectory
+        trajectory.with_initial_command(_command(trajectory, rule), alike) if undecided(trajectory) else trajectory
         for trajectory in trajectories
     ]
 

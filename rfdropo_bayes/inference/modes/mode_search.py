@@ -1,10 +1,10 @@
 """Search for modes: optimisations from the best of many prior draws, over growing horizons, then Laplace.
 
 1. Optimisations start at prior draws that explain a short prefix of the data: the best draw, and distant draws of the
-   best quarter. The medians of the prior count as a draw. If the budget allows it, a pilot run (`pilot_run`) replaces the draws: particles tempered from the
-   prior to the posteriors of short prefixes. An optimisation stops at the first local optimum, and the best prior draws
-   need not lie near the highest. A slowly tempered population ends in the basins with most mass, at horizons with cheap
-   rollouts.
+   best quarter. The medians of the prior count as a draw. If the budget allows it, a pilot run (`pilot_run`) replaces
+   the draws: particles tempered from the prior to the posteriors of short prefixes. An optimisation stops at the first
+   local optimum, and the best prior draws need not lie near the highest. A slowly tempered population ends in the
+   basins with most mass, at horizons with cheap rollouts.
 2. Each optimisation is a Levenberg-Marquardt search at growing horizons. Short prefixes come first, because a long
    recording has many local optima.
 3. Each optimum keeps one optimisation for the next horizon: the better half of the optima, and every optimum within
@@ -205,7 +205,7 @@ def starts_of_draws(
     draw = problem.sample_starts if isinstance(problem, WarmStart) else problem.sample_prior
     own, many = (
         np.asarray(problem.to_unconstrained(draw(each, number)), dtype=float)
-        for each, number in ((key, max(prior_draws, count)), (jax.random.fold_in(key, 1), FOR_MEDIANS))
+        for each, number in ((key, max(prior_draws, count, 2) - 1), (jax.random.fold_in(key, 1), FOR_MEDIANS))
     )
     u = np.concatenate([np.median(many, axis=0)[None], own])  # in many dimensions no draw comes near the middle
     density = _heights(problem, u, horizon, ledger)
