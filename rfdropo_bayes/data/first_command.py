@@ -54,15 +54,15 @@ def begun_from(trajectory: Trajectory, rule: Rule | None) -> Trajectory:
         angle = angle_at_first(trajectory)
         if angle is not None:
             return trajectory.with_initial_command(angle, MEASURED)
-        rule, why = recognised(trajectory)
-    elif settled:
+        found = recognised(trajectory)
+        return trajectory.with_initial_command(_command(trajectory, found.rule), found._asdict())
+    if settled:
         raise InputError(
             "initial_command is set, but every row is the pose at rest under its own command",
             where=f"[data] initial_command, {trajectory.name}",
             remedy="leave initial_command out for it",
         )
-    else:
-        why = "initial_command in [data]"
+    why = "initial_command in [data]"
     if not isinstance(rule, str):
         channels = trajectory.cable_names
         if len(rule) != len(channels):
