@@ -147,7 +147,7 @@ class ExtensionSearch:
         if steps <= self.rules.effects or self.target.known is not None:
             return True
         left, taken = (float(fit.residual @ fit.residual) for fit in (before, after))
-        misfit = max(left - np.count_nonzero(before.residual), 0.0)
+        misfit = max(left - float(np.count_nonzero(before.residual)), 0.0)
         return left - taken > self.rules.significant * misfit > 0.0
 
     def score_tests(self, fit: Fit, without: Sequence[str] = ()) -> ScoreTests:
