@@ -10,9 +10,9 @@ Five kinds, each with its pattern in the numbers:
 - *jump*: the tracker fitted the wrong rigid body for a row or a short run of rows, and then came back; two markers that
   swap for a row jump both. A jump is a step that differs from the neighbouring steps by more than ``TOLERANCE +
   MAX_ACCELERATION * dt**2``, or than ``UNUSUAL`` times as much as half of the steps do: noise makes all steps differ.
-  The longest smooth path of each marker is kept: the largest set of rows in which every row
-  can be reached from its predecessor. At most ``LONGEST_RUN`` rows are left out at a time, so a lasting change of level
-  (a moved frame, an impact) is kept and counted among the *breaks*.
+  The longest smooth path of each marker is kept: the largest set of rows in which every row can be reached from its
+  predecessor. At most ``LONGEST_RUN`` rows are left out at a time, so a lasting change of level (a moved frame, an
+  impact) is kept and counted among the *breaks*.
 - *renamed*: the place of a marker under the name of another (`identities`).
 
 At low sampling rates ``MAX_ACCELERATION * dt**2`` exceeds any motion: no row is masked then.
