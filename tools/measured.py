@@ -56,11 +56,12 @@ def days() -> dict[str, dict[float, Mapping[str, Any]]]:
     return found
 
 
-def audits(ledger: str, seeds: Sequence[int] = ()) -> dict[str, Mapping[str, Any]]:
+def audits(*ledgers: str, seeds: Sequence[int] = ()) -> dict[str, Mapping[str, Any]]:
     """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``); of some
     seeds if they are given.
     """
-    lines = [line for line in read_lines(REPORTS / ledger) if not seeds or line["job"]["seed"] in seeds]
+    every = [line for ledger in ledgers for line in read_lines(REPORTS / ledger)]
+    lines = [line for line in every if not seeds or line["job"]["seed"] in seeds]
     right: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
         "null": lambda result: result["verdict"] == "no_discrepancy",
         "removed": lambda result: result["verdict"] not in ("explained", "equivalent"),
@@ -144,7 +145,7 @@ def page() -> str:
         days=days(),
         asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
-        motion=audits("audit_power/unknown_scale/datasets.jsonl"),
+        motion=audits("audit_power/unknown_scale/datasets.jsonl", "audit_power/visible_steps/datasets.jsonl"),
         today=audits("audit_power/visible_steps/datasets.jsonl", seeds=(5008, 5009)),
         laws=laws(),
         sizes=sizes(),

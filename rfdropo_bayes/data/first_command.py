@@ -93,9 +93,9 @@ def common_beginning(trajectories: Sequence[Trajectory]) -> Literal["first", "ze
     return "first" if rules == {"first"} else "zero" if rules == {"zero"} else None
 
 
-def begun_alike(trajectories: Sequence[Trajectory]) -> list[Trajectory]:
-    """Recordings of one experiment; those that do not decide how they begin do so as the others, if these agree."""
-    rule = common_beginning(trajectories)
+def begun_alike(trajectories: Sequence[Trajectory], others: Sequence[Trajectory] = ()) -> list[Trajectory]:
+    """Recordings of one experiment; if they do not decide how they begin, they begin as all that do, if these agree."""
+    rule = common_beginning([*trajectories, *others])
     if rule is None:
         return list(trajectories)
     alike = {"rule": rule, "why": "as the other recordings begin; its own first rows do not decide"}

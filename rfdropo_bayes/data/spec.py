@@ -165,7 +165,7 @@ def load_recordings(spec: DataSpec, base: Path, role: Literal["fit", "test"] = "
     sources = fit if role == "fit" else test
     _check_split(fit, test)
     loaded: dict[tuple[Path, int | None, Path | None, str], Trajectory] = {}
-    for source in (*sources, *fit, *test):
+    for source in (*sources, *fit):  # fitted recordings show how the others begin, not the other way round
         if source.key not in loaded and (source in sources or any(map(undecided, loaded.values()))):
             loaded[source.key] = begun_from(_read(spec, source), source.initial_command)
     begun = dict(zip(loaded, begun_alike(list(loaded.values())), strict=True))

@@ -14,6 +14,7 @@ from rfdropo_bayes.bayes.noise.autoregression import STATED
 from rfdropo_bayes.bayes.priors import table_of
 from rfdropo_bayes.bayes.trajectory_model import TrajectoryModel
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.first_command import begun_alike
 from rfdropo_bayes.data.given_recordings import given_recordings
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.model.assembly import (
@@ -213,10 +214,10 @@ class Model:
         """
         if fit is None:
             return self.recordings("fit"), self.recordings("test") if test is None else given_recordings(test, "test")
-        runs = given_recordings(fit, "runs")
+        runs = begun_alike(given_recordings(fit, "runs"))
         if not runs:
             raise InputError("the list of recordings is empty", where="runs", remedy="give at least one")
-        return runs, given_recordings(test or (), "test")
+        return runs, begun_alike(given_recordings(test or (), "test"), runs)
 
     def record(self, meant: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
         """Tables for the record of a run, as an experiment file has them.

@@ -93,6 +93,7 @@ def test_undecided_recordings_begin_as_the_others_of_their_experiment():
     )
     np.testing.assert_array_equal(open_end.initial_command, command[0])
     assert not begun_alike([open_end, from_rest])[0].initial_command.any()
+    assert not begun_alike([open_end], [from_rest])[0].initial_command.any()
     for others in ([going_on], [from_rest, going_on], []):
         np.testing.assert_array_equal(begun_alike([open_end, *others])[0].initial_command, command[0])
 
