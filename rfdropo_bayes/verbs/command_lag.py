@@ -21,6 +21,7 @@ RIDGE = 1e-6  # ridge penalty of the maps, as a share of the mean square of thei
 CLEARLY = 0.9  # ratio of the root mean square residuals of two maps below which the better map is reported
 
 APART = 0.3  # the same ratio of two neighbours' commands below which each row is a pose of its own
+UNSETTLED = 2.0  # ratio of the residuals in rows after a change of the commands and in others beyond which bodies move
 
 
 class LagError(NamedTuple):
@@ -38,12 +39,20 @@ def errors_by_row(runs: Sequence[Trajectory], lags: Sequence[int] = (-1, 0, 1, 2
 def apart(run: Trajectory) -> str | None:
     """Why each row is a pose of its own, in words: it shows one command, and nothing of the command before or after.
 
-    None for rows of a continuous motion.
+    None for rows of a continuous motion. If commands are held for several rows, a map of them fits most rows of any
+    body: then rows that follow a change must fit as well as the others.
     """
-    one, other = sorted(each.error for each in errors_by_row([run], (0, 1)))
-    if one >= APART * other:
+    one, other = sorted(errors_by_row([run], (0, 1)), key=lambda each: each.error)
+    if one.error >= APART * other.error:
         return None
-    return f"a map of one row's command leaves {1e3 * one:.3g} mm, of its neighbour's {1e3 * other:.3g} mm"
+    ((positions, sent),) = _series([run])
+    own = _shifted(sent, one.rows)
+    residuals, _ = _map_residuals([(positions, own)])
+    whole, changed = np.isfinite(residuals).all(axis=1), np.append(True, np.diff(own, axis=0).any(axis=1))
+    after, held = whole & changed, whole & ~changed
+    if held.any() and np.mean(residuals[after] ** 2) > UNSETTLED**2 * np.mean(residuals[held] ** 2):
+        return None
+    return f"a map of one row's command leaves {1e3 * one.error:.3g} mm, of its neighbour's {1e3 * other.error:.3g} mm"
 
 
 def best_delay(runs: Sequence[Trajectory]) -> float:
@@ -76,21 +85,32 @@ def _shifted(command: Float[np.ndarray, "row channel"], lag: int) -> Float[np.nd
 
 
 def _map_error(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Residual of a single map for all recordings, with a separate mean per recording."""
-    parts = []
+    """Root mean square residual of a single map for all recordings; infinite without data."""
+    residuals, free = _map_residuals(series)
+    return float(np.sqrt(np.nansum(residuals**2) / free)) if free else np.inf
+
+
+def _map_residuals(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[Float[np.ndarray, "row coordinate"], int]:
+    """Residuals of a single map for all recordings, with a separate mean per recording, and their degrees of freedom.
+
+    Rows that are not whole are NaN. Without data there are no degrees of freedom.
+    """
+    features, motion, used = [], [], []
     for position, command in series:
         whole = np.isfinite(position).all(axis=1) & np.isfinite(command).all(axis=1)
-        if whole.sum() > 1:
-            features = _quadratic(command[whole])
-            parts.append((features - features.mean(axis=0), position[whole] - position[whole].mean(axis=0)))
-    if not parts:
-        return np.inf
-    features, motion = (np.concatenate(each) for each in zip(*parts, strict=True))
-    gram = features.T @ features
+        whole &= whole.sum() > 1
+        shape = _quadratic(command[whole])
+        features.append(shape - (shape.mean(axis=0) if whole.any() else 0.0))
+        motion.append(position[whole] - (position[whole].mean(axis=0) if whole.any() else 0.0))
+        used.append(whole)
+    known, moved, rows = np.concatenate(features), np.concatenate(motion), np.concatenate(used)
+    residuals = np.full((len(rows), moved.shape[1]), np.nan)
+    if not rows.any():
+        return residuals, 0
+    gram = known.T @ known
     ridge = RIDGE * np.trace(gram) / len(gram) + 1e-300
-    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), features.T @ motion)
-    free = max(len(motion) - np.linalg.matrix_rank(features), 1)
-    return float(np.sqrt(np.sum((motion - features @ weights) ** 2) / free))
+    residuals[rows] = moved - known @ np.linalg.solve(gram + ridge * np.eye(len(gram)), known.T @ moved)
+    return residuals, max(len(moved) - int(np.linalg.matrix_rank(known)), 1)
 
 
 def _quadratic(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row feature"]:

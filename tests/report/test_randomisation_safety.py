@@ -84,6 +84,10 @@ def test_every_grave_ground_makes_it_unsafe(run, summary, change, words):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        (
+            lambda s: s["rmse"]["test"].update({"middle": 1.6 * s["rmse"]["fit"]["middle"]}),
+            "what was fitted does not hold for them",
+        ),
         (lambda s: s["noise_floor_mm"].update(tip=0.1), "where repeats differ by 0.1 mm"),
         (lambda s: s["error_correlation"]["test"].update(tip=0.83), "correlation 0.83 at the tip"),
         (lambda s: s["rmse"]["test"].update(middle=0.88), "0.88 mm against"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import rfdropo_bayes as rb
+from rfdropo_bayes.verbs.command_lag import APART, apart, errors_by_row
 from rfdropo_bayes.verbs.slow_motion import command_rate, first_period, slow_motion
 
 ARM = rb.Robot.outline(name="arm", length=0.2, radius=0.01, markers={"tip": 0.2}, cables=1)
@@ -60,3 +61,24 @@ def test_rows_that_show_their_own_commands_are_poses_at_rest():
     assert (
         slow_motion(ARM, rb.Trajectory.from_arrays(time=time, position=moved, command=pulled[:, None], **given)) is None
     )
+
+
+@pytest.mark.parametrize("stays", [0.0, 0.2], ids=["at rest", "moving"])
+def test_held_commands_show_whether_the_body_moves_after_a_change(stays):
+    """A row after a change keeps a share of the way, which vanishes in the mean over all rows of a held command."""
+    rng = np.random.default_rng(1)
+    level = 0.01 * np.repeat(rng.random(20), 12)
+    shown = level.copy()
+    for row in range(1, len(level)):
+        shown[row] = level[row] + stays * (shown[row - 1] - level[row])
+    moved = np.stack([shown, 0.1 * shown, 0.2 - shown**2], axis=1)[:, None] + 2e-5 * rng.standard_normal((240, 1, 3))
+    given = {
+        "markers": ["tip"],
+        "channels": ["pull_1"],
+        "command_time": 0.05 * np.arange(240),
+        "initial_command": "first",
+    }
+    run = rb.Trajectory.from_arrays(time=0.05 * np.arange(240), position=moved, command=level[:, None], **given)
+    assert (apart(run) is None) == (stays > 0.0)
+    one, other = sorted(each.error for each in errors_by_row([run], (0, 1)))
+    assert one < APART * other
