@@ -3,8 +3,8 @@
 It is given, or measured, or recognised from how the recording begins. Measured motor angles show the first command.
 Without them, either the first command was in force already, so that the robot rests until commands change, or no
 command was, and the robot starts from its rest pose. A linear robot with a dead time and a lag is fitted for both
-cases; the case with the smaller error in the first rows is taken. Recordings that do not decide begin as the others of
-their experiment do.
+cases; the case with the smaller error in the first rows is taken. If that does not decide, a robot that moves while the
+first command is held was not at rest under it. Other recordings begin as those of their experiment that decide.
 """
 
 from __future__ import annotations
@@ -29,6 +29,9 @@ LOOKED_AT = 20.0  # [s] of a recording, at most
 FEWEST_ROWS = 4  # at the beginning, to compare on
 RANK = 1e-9  # singular values below this share of the largest are rounding: channels that move together
 CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 starts none fell on the wrong side
+STILL = 0.1  # quantile of the distances from row to row, which show the noise if the robot rests in some rows
+MOVES = 11.0  # such distances beyond which a robot moves: 5 deviations of a step of white noise
+PART = 0.1  # share of the way of the markers by which it moves then; more than creep under a held command
 MEMORY = "memory"  # the format of recordings from arrays
 UNTOLD = ("asl-csv", "csv", "motive-csv", "rosbag", "lerobot", MEMORY)
 """Formats that do not state the command before their first row."""
@@ -143,7 +146,24 @@ def recognised(trajectory: Trajectory) -> Beginning:
         return Beginning("zero", f"recognised: {evidence}")
     if first < CLEARLY * zero:
         return Beginning("first", f"recognised: {evidence}")
+    if (moved := moved_while_held(trajectory)) is not None:
+        return Beginning("zero", f"recognised: it moves by {1e3 * moved:.2g} mm while the first command is held")
     return Beginning(UNDECIDED, f"assumed: {evidence}, which does not decide")
+
+
+def moved_while_held(trajectory: Trajectory) -> float | None:
+    """Distance [m] that a marker moves before commands change; None if it is noise, or a small part of its way."""
+    seen = np.where(trajectory.position_mask[..., None], trajectory.position, np.nan)
+    steps = np.linalg.norm(np.diff(seen, axis=0), axis=-1)
+    changes = np.flatnonzero((trajectory.command != trajectory.command[0]).any(axis=1))
+    held = trajectory.time <= (trajectory.command_time[changes[0]] if len(changes) else np.inf)
+    whole = np.isfinite(seen[held]).all(axis=(1, 2))
+    if whole.sum() < 2 or not np.isfinite(steps).any():
+        return None
+    first, last = seen[held][whole][[0, -1]]
+    way = np.sqrt(np.nanmean(np.sum((seen - np.nanmean(seen, axis=0)) ** 2, axis=-1)))
+    moved = float(np.linalg.norm(last - first, axis=-1).max())
+    return moved if moved > max(MOVES * np.nanquantile(steps, STILL), PART * way) else None
 
 
 def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:

@@ -75,6 +75,21 @@ def test_a_start_is_never_taken_for_the_other(hold):
     assert decided >= 6
 
 
+def test_a_robot_that_moves_while_the_first_command_is_held_was_not_at_rest_under_it():
+    """Positions bend by their square, so that a linear robot misses more than the two starts differ by."""
+    told = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        command = np.repeat(0.03 * rng.uniform(-1.0, 1.0, (8, CHANNELS)), 20, axis=0)
+        for initial in (0.0 * command[0], command[0]):
+            made = recording(command, initial, seed)
+            bent = made.dataset.copy()
+            bent["position"] = bent["position"] + 50.0 * (bent["position"] - bent["position"].mean("time")) ** 2
+            told.append(recognised(Trajectory(bent)).rule)
+    assert told[::2] == ["zero"] * 8
+    assert "zero" not in told[1::2]
+
+
 def test_a_step_that_is_held_is_told_from_a_motion_that_dies_away():
     command = np.tile([[0.03, 0.0, -0.02]], (60, 1))
     assert recognised(recording(command, np.zeros(3))).rule == "zero"
