@@ -137,6 +137,8 @@ def numerical_error_lines(spec: ModelSpec, recording: Trajectory) -> list[tuple[
     said = []
     if error.time_step is not None:
         said.append(f"a quarter of the time step ({step:.4g} ms, {integrator}): {error.time_step:.2g} mm {over}")
+        if 1e3 * simulator.robot.command.ramp_s < step:
+            said.append("drives carry out a change within a step: state their time, ramp_s in the robot file")
     if error.elements is None:
         said.append("the mesh of tetrahedra is as given: the error of the mesh is not measured")
     else:
