@@ -75,7 +75,7 @@ def commands_on_grid(
         if np.any(np.diff(clock) < 0):
             raise InputError(f"{name} times decrease at row {int(np.argmax(np.diff(clock) < 0)) + 1}")
     _check_steps(time, observation_time, time_step)
-    before = _steps_before(time, observation_time, time_step)
+    before = _steps_before(time + dead_time if dead_time < 0.0 else time, observation_time, time_step)
     elapsed = before + (observation_time - observation_time[0]) / time_step
     # Observation clocks jitter by microseconds: an observation within 1e-6 of a step's end belongs to that step.
     sample_step = np.floor(elapsed + 1e-6).astype(np.int32)

@@ -181,9 +181,17 @@ class RobotSimulator(ExtendedSimulator):
         initial: Float[np.ndarray, " channel"],
         observation_time: Float[np.ndarray, " time"],
     ) -> Commands:
-        """Recorded commands on the simulator's clock, with the robot's ramp and lag."""
-        timing, given = self.robot.command, (time, value, initial, observation_time)
-        return commands_on_grid(*given, time_step=self.time_step, ramp=timing.ramp_s, dead_time=timing.dead_time_s)
+        """Recorded commands on the simulator's clock, with the robot's ramp and dead time.
+
+        Within a time step commands change linearly. A change that takes less time is spread over a step about its
+        middle: if it began at its time, it would be half a step late.
+        """
+        ramp, dead_time = self.robot.command.ramp_s, self.robot.command.dead_time_s
+        if not self.at_rest and ramp < self.time_step:
+            ramp, dead_time = self.time_step, dead_time - 0.5 * (self.time_step - ramp)
+        return commands_on_grid(
+            time, value, initial, observation_time, time_step=self.time_step, ramp=ramp, dead_time=dead_time
+        )
 
     def body_inputs(self, values: Values) -> tuple[Any, CubeInputs | None]:
         """Material of the body, and the cube before it, for these values."""
