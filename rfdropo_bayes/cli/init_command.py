@@ -355,7 +355,7 @@ def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: b
 
 
 def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> dict[str, float]:
-    """Heights [mm] of the markers by name; evenly spaced if they are not given."""
+    """Heights [mm] of the markers by name, in the order of the columns; evenly spaced if they are not given."""
     names = guess.markers if guess is not None else ["m1", "m2", "m3"]
     spaced = ",".join(f"{name}={length * (k + 1) / len(names):.4g}" for k, name in enumerate(names))
     text = ask.answer("markers", given, "Markers and their heights [mm]", spaced)
@@ -374,4 +374,8 @@ def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> di
             where="--markers",
             remedy="name one for each, in the order of the columns",
         )
+    named = {name.casefold(): name for name in heights}
+    columns = [] if guess is None else [name.casefold() for name in guess.markers]
+    if set(columns) == set(named):  # the columns' own names, in whatever order
+        return {named[name]: heights[named[name]] for name in columns}
     return heights

@@ -115,7 +115,9 @@ def _systematic(summary: Mapping[str, Any]) -> list[str]:
             f"errors of the {role} recordings last from row to row (correlation {places}): something systematic is "
             "missing from the simulator, and randomising its parameters does not put it there"
         )
-    return [*reasons, *_beyond_fitted(summary, errors), *_near_baselines(summary, errors)] if role == "test" else reasons
+    if role == "fit":
+        return reasons
+    return [*reasons, *_beyond_fitted(summary, errors), *_near_baselines(summary, errors)]
 
 
 def _beyond_fitted(summary: Mapping[str, Any], errors: Mapping[str, float]) -> list[str]:
@@ -127,8 +129,8 @@ def _beyond_fitted(summary: Mapping[str, Any], errors: Mapping[str, float]) -> l
     worst = max(pairs, key=lambda marker: pairs[marker][0] / pairs[marker][1])
     error, own = pairs[worst]
     return [
-        f"test recordings are off by {error:.3g} mm at {_place(worst, errors)}, fitted recordings by {own:.3g} mm: what "
-        "was fitted does not hold for them"
+        f"test recordings are off by {error:.3g} mm at {_place(worst, errors)}, fitted recordings by {own:.3g} mm: "
+        "what was fitted does not hold for them"
     ]
 
 

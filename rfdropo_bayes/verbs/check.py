@@ -40,11 +40,12 @@ from rfdropo_bayes.verbs.audit import candidate_names
 from rfdropo_bayes.verbs.calibrate import inference_options
 from rfdropo_bayes.verbs.command_lag import lag_words
 from rfdropo_bayes.verbs.motion_check import measure_motion
+from rfdropo_bayes.verbs.motion_direction import AGREEING
 from rfdropo_bayes.verbs.numerical_error import numerical_error_lines
 from rfdropo_bayes.verbs.placement import far_from_rest
 from rfdropo_bayes.verbs.preflight import PRIOR_DRAWS, Preflight, preflight
 from rfdropo_bayes.verbs.recording_doubts import asked_pulls, drives_beyond, recording_cautions, shortened
-from rfdropo_bayes.verbs.rest_fit import first_answer, rest_lines, rest_notes
+from rfdropo_bayes.verbs.rest_fit import first_answer, misread, rest_lines, rest_notes
 
 MILLIMETRES = 1e3
 LONG = 60.0  # recordings of more seconds make whoever checks them wait for minutes
@@ -188,6 +189,8 @@ def _say_motion(
         if fit is not None:
             report.lines += rest_lines(fit)
             report.notes += rest_notes(fit) if rests else []
+            if not report.doubts and compared.agreement < AGREEING and (words := misread(fit)) is not None:
+                report.doubts.append(words)
             report.files.append(out / "at_rest.png")
             rest_figure(fit).savefig(report.files[-1])
 

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.counters import Column, Motion, quoted_key, read_on, turns_of, wraps_of
@@ -29,7 +28,7 @@ from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
 from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
 from rfdropo_bayes.verbs.command_lag import errors_by_row
 from rfdropo_bayes.verbs.days import Piece, days_of, group_lines, last_third, pieces_of
-from rfdropo_bayes.verbs.installation import installed_mechanisms, installed_priors
+from rfdropo_bayes.verbs.installation import DriveZero, installed_mechanisms, installed_priors, zero_of_drives
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
@@ -216,7 +215,7 @@ def write_first_files(
         experiment.write_text("\n".join(lines), encoding="utf-8")
         return load_experiment(experiment)[0]
 
-    days, zero = days_of(recordings), None
+    days, zero = days_of(recordings), None  # type: tuple[Any, DriveZero | None]
     if guess is None:
         write(_random_commands(outline))
         return robot, experiment
@@ -227,10 +226,10 @@ def write_first_files(
     if not runs:
         return robot, experiment
     first = runs[0]
-    if guess.reads_drives and guess.unwrap:  # the zero of a counter that wraps is anywhere in a turn
-        zero = first.command.mean(axis=0)
+    if first.command_unit in ("m", "rad"):
+        zero = zero_of_drives(runs, wraps=bool(guess.reads_drives and guess.unwrap))
     sent = np.vstack([first.initial_command, first.command])
-    usual = float(np.max(np.abs(sent if zero is None else sent - zero)))
+    usual = float(np.max(np.abs(sent if zero is None else sent - zero.command)))
     outline = replace(outline, usual_command=usual or None)
     robot.write_text(robot_text(outline), encoding="utf-8")
     made = Robot.load(robot)
@@ -253,7 +252,14 @@ def write_first_files(
     seen = runs[0]
     bends = outline.sets_bend is not None
     scaled, stiff = ("length" in outline.assumed), ("young_modulus" in outline.assumed)
-    registration = register(spec_of(placed, folder), seen, scaled=scaled, bends=bends, stiff=stiff, zero=zero)
+    registration = register(
+        spec_of(placed, folder),
+        seen,
+        scaled=scaled,
+        bends=bends,
+        stiff=stiff,
+        zero=None if zero is None else zero.command,
+    )
     ordered, order = guess, None
     if registration.arrangement is not None:
         turns = np.degrees(registration.arrangement.turns)
@@ -513,7 +519,7 @@ def _model(
     first: Trajectory | None,
     seen: Frame | None,
     gain: float,
-    zero: Float[np.ndarray, " channel"] | None,
+    zero: DriveZero | None,
     *,
     rests: bool,
 ) -> list[str]:

@@ -6,12 +6,14 @@ recording: shares of the largest pull and of the body's length, and angles of a 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.mechanisms.actuation import GuideAzimuth
 from rfdropo_bayes.mechanisms.sizes import scales_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.arrangement import sections_of
@@ -20,6 +22,7 @@ from rfdropo_bayes.verbs.registration import UNSTATED, Frame, lies
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
 1.5 mm, and a slack of 2 mm on another day."""
+AWAY = 0.5  # least distance of a channel's commands from zero over their range if its drive has a zero of its own
 ORIGIN = 0.05  # standard deviation of the frame's origin over the body's length
 TILT, TURN = 0.1, 0.5
 """Standard deviations of the frame's tilt, and of its turn about the body's axis [rad]. That arm's frame was turned by
@@ -28,6 +31,30 @@ GAIN = 0.1  # standard deviation of the relative error of a command in metres of
 UNKNOWN = 0.5
 """The same of a robot whose cables' distance from the axis, or whose length, was not given; and of pressures and inputs
 of drives, whose force per command no answer states."""
+
+
+class DriveZero(NamedTuple):
+    """Commands [m or rad] at which the body is about straight, and how they are known."""
+
+    command: Float[np.ndarray, " channel"]
+    words: str
+
+
+def zero_of_drives(recordings: Sequence[Trajectory], *, wraps: bool) -> DriveZero | None:
+    """The zero of drives that have their own, as servos at 2048 counts; None if zero commands are near.
+
+    Args:
+        recordings: of one robot, with commands of imposed lengths.
+        wraps: whether commands are counts that begin anew after a turn, whose zero is anywhere.
+    """
+    sent = np.concatenate([run.command for run in recordings])
+    away = np.abs(sent).min(axis=0) > AWAY * np.ptp(sent, axis=0)
+    if not wraps and not away.all():
+        return None
+    first = np.array([run.command[0] for run in recordings])
+    if wraps or np.ptp(first, axis=0).any():
+        return DriveZero(sent.mean(axis=0), "the mean of the commands")
+    return DriveZero(first[0], "the command at which recordings begin")
 
 
 def largest_pull(robot: Robot, recording: Trajectory, zero: Float[np.ndarray, " channel"] | float = 0.0) -> float:
@@ -46,7 +73,7 @@ def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[st
     gain = ["command_gain"] if robot.command_unit in ("m", *UNSTATED) else []
     scale = ["camera_scale"] if "length" in assumed else []
     stretch = ["cable_compliance"] if _pulled_by_section(robot) or _hardly_shortens(robot) else []
-    sections = ["guide_azimuth"] if _pulled_by_section(robot) else []
+    sections = ["guide_azimuth"] if _turned_by_hand(robot) else []
     tilt = ["base_tilt"] if lies(robot) and "segment_azimuths" in assumed else []
     return ["axial_stiffness", "camera_rotation", *gain, *scale, *stretch, *sections, *tilt]
 
@@ -54,6 +81,11 @@ def installed_mechanisms(robot: Robot, assumed: Collection[str] = ()) -> list[st
 def _pulled_by_section(robot: Robot) -> bool:
     """Whether cables of imposed lengths end at several heights."""
     return robot.actuators[0].unit == "m" and sections_of(robot).number > 1
+
+
+def _turned_by_hand(robot: Robot) -> bool:
+    """Whether the cables of several sections have azimuths of their own; cables that share a drive have none."""
+    return _pulled_by_section(robot) and bool(GuideAzimuth.for_robot(robot).parameters)
 
 
 def _hardly_shortens(robot: Robot) -> bool:
@@ -70,7 +102,7 @@ def installed_priors(
     frame: Frame | None = None,
     assumed: Collection[str] = (),
     gain: float = 1.0,
-    zero: Float[np.ndarray, " channel"] | None = None,
+    zero: DriveZero | None = None,
 ) -> list[str]:
     """Lines of [model.priors] of a robot as it is installed.
 
@@ -80,7 +112,7 @@ def installed_priors(
         frame: frame in which a rod at rest explains that recording; priors are centred there.
         assumed: unknown sizes of the robot, which get wide priors.
         gain: force of drives that explains that recording, over the robot file's, if no answer states it.
-        zero: command at which the body is about straight, of drives whose zero is anywhere in a turn.
+        zero: zero of drives that have their own.
     """
     lines = []
 
@@ -88,12 +120,12 @@ def installed_priors(
         lines.append(f'{name} = {{ distribution = "Normal", loc = {loc:.3g}, scale = {scale:.2g} }}  # {words}')
 
     if robot.initial_displacement_names:
-        from_zero = 0.0 if zero is None else zero
+        from_zero = 0.0 if zero is None else zero.command
         pull = scales_of(robot).pull if recording is None else largest_pull(robot, recording, from_zero)
         if pull > 0.0 and zero is not None:
-            wound = np.asarray(robot.channel_matrix(robot.nominal())) @ zero
+            wound = np.asarray(robot.channel_matrix(robot.nominal())) @ zero.command
             for name, place in zip(robot.initial_displacement_names, wound, strict=True):
-                normal(name, ZERO * pull, "zero of the cable, from the mean of the commands", -place)
+                normal(name, ZERO * pull, f"ASSUMED: zero of the cable, from {zero.words}", -place)
         elif pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
     turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.remaining_turn, frame.shift)
@@ -114,7 +146,7 @@ def installed_priors(
         normal("camera_scale_error", UNKNOWN, "lengths over the robot file's lengths, less 1")
     if _pulled_by_section(robot) or _hardly_shortens(robot):
         lines.append("cable_compliance = {}  # stretch of a cable over its tension")
-    if _pulled_by_section(robot):
+    if _turned_by_hand(robot):
         wide, words = (TURN, "which was not given") if "segment_azimuths" in assumed else (TILT, "over the drawing's")
         normal("guide_azimuth_error", wide, f"azimuth of the cables of a channel, {words}")
     lines.append("axial_stiffness = {}  # in tension, over that which the profile has for its bending")

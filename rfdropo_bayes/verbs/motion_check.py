@@ -112,6 +112,7 @@ class Compared(NamedTuple):
     """Comparison with the robot at rest."""
 
     words: str  # summary
+    agreement: float  # of the directions of motion, as the recordings were read; 0 without equilibria
     cautions: list[Caution]  # cautions on frame, order and unit of the commands
     arrangement: Arrangement | None  # best arrangement of the commands; None without equilibria under them
 
@@ -139,7 +140,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
         smaller = _explained(robot, rows, likely_units(units, None))
         said = "the robot has no equilibrium under most of the commands as they were read"
         words = f"{said}, and the markers moved by {1e3 * measured:.3g} mm; {unit_words(columns, smaller)}"
-        return Compared(said, [Caution(Code.UNIT_DOUBTFUL, words)], None)
+        return Compared(said, 0.0, [Caution(Code.UNIT_DOUBTFUL, words)], None)
     direction, finding = direction_of([here]), find_arrangement(robot, rows)
     proposal = _proposal(finding, robot.simulator.robot, columns, runs[0].cable_names)
     if proposal is not None:
@@ -155,7 +156,7 @@ def measure_motion(spec: ModelSpec, recordings: Sequence[Trajectory], columns: C
     )
     cautions = motion_cautions(Motion(direction, size, proposal, other), columns, unit)
     written = as_written(len(rows.command[0]), len(finding.arrangement.turns))
-    return Compared(words, cautions, finding.arrangement if cautions else written)
+    return Compared(words, finding.written.straight, cautions, finding.arrangement if cautions else written)
 
 
 def _paths(robot: RestingRobot, rows: Rows, factor: float = 1.0) -> Paths:

@@ -368,6 +368,17 @@ def test_a_file_without_names_is_read_by_the_names_that_init_suggests(tmp_path, 
     assert read.marker_names == ("low", "tip")
 
 
+def test_heights_belong_to_the_markers_that_they_name(tmp_path, monkeypatch, capsys):
+    table("t", "{marker}_{axis}", "motor{0}").to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    words = ("--recording", "run.csv", "--length-mm", "200", "--markers", "Tip=200,low=100")
+    assert init(monkeypatch, capsys, "arm", *words)[0] == 0
+    experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
+    robot = find_robot(experiment.robot, tmp_path / "arm")
+    assert dict(zip(robot.marker_names, robot.marker_points()[:, 2], strict=True)) == {"low": 0.1, "tip": 0.2}
+    assert load_recordings(experiment.data, tmp_path / "arm")[0].marker_names == ("low", "tip")
+
+
 def test_positions_and_commands_may_be_two_files_without_names(tmp_path, monkeypatch, capsys):
     run = table("t", "{marker}_{axis}", "u{0}")
     sent = [name for name in run if name.startswith("u")]

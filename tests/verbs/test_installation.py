@@ -13,7 +13,15 @@ from rfdropo_bayes.model.run_folder import CONFIG
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.budget import FEWEST_DRAWS, FEWEST_ROLLOUTS, MOST_DRAWS, budget_within
 from rfdropo_bayes.verbs.calibrate import _budgeted
-from rfdropo_bayes.verbs.installation import ORIGIN, ZERO, installed_mechanisms, installed_priors, largest_pull
+from rfdropo_bayes.verbs.installation import (
+    ORIGIN,
+    ZERO,
+    DriveZero,
+    installed_mechanisms,
+    installed_priors,
+    largest_pull,
+    zero_of_drives,
+)
 
 
 def arm(scale: float = 1.0, unit: str = "rad") -> Robot:
@@ -23,9 +31,13 @@ def arm(scale: float = 1.0, unit: str = "rad") -> Robot:
 
 
 def run(unit: str, size: float, rows: int = 90) -> Trajectory:
-    time = 0.1 * np.arange(rows)
     command = np.zeros((rows, 4))
     command[:, 1] = -size * np.linspace(0.0, 1.0, rows)
+    return recorded(unit, command)
+
+
+def recorded(unit: str, command: np.ndarray) -> Trajectory:
+    time = 0.1 * np.arange(len(command))
     return Trajectory.from_arrays(
         time=time,
         time_unit="s",
@@ -69,10 +81,32 @@ def test_zeros_without_a_recording_are_lengths_of_cable_whatever_the_unit_of_com
 
 def test_zeros_of_drives_that_count_from_anywhere_are_centred_at_the_mean_of_the_commands():
     robot, zero = arm(), np.array([3.0, -1.0, 0.5, 2.0])[: len(arm().channel_names)]
-    lines = installed_priors(robot, run("rad", 2.0), zero=zero)
+    lines = installed_priors(robot, run("rad", 2.0), zero=DriveZero(zero, "the mean of the commands"))
     wound = np.asarray(robot.channel_matrix(robot.nominal())) @ zero
     for name, place in zip(robot.initial_displacement_names, wound, strict=True):
         assert any(line.startswith(f"{name} = ") and f"loc = {-place:.3g}," in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("rest", "moved", "zero"),
+    [
+        (3.1, 1.0, 3.1),  # a servo in the middle of its counts
+        (1.6, -1.0, 1.6),  # at 90 degrees
+        (0.0, 1.0, None),  # cables that are pulled in
+        (0.2, 1.0, None),  # and that a little tension keeps straight
+    ],
+)
+def test_drives_that_never_come_near_zero_have_a_zero_of_their_own(rest, moved, zero):
+    going = moved * np.random.default_rng(0).random((2, 90, 4))
+    going[:, 0] = 0.0
+    runs = [recorded("rad", rest + each) for each in going]
+    found = zero_of_drives(runs, wraps=False)
+    assert (found is None) == (zero is None)
+    if found is not None:
+        np.testing.assert_allclose(found.command, zero)
+        assert found.words == "the command at which recordings begin"
+        elsewhere = [runs[0], recorded("rad", rest + going[1][::-1])]
+        assert zero_of_drives(elsewhere, wraps=False).words == "the mean of the commands"
 
 
 def test_commands_that_never_move_leave_zeros_fixed():
@@ -86,6 +120,7 @@ def test_cables_of_an_arm_with_sections_stretch_and_are_turned():
     assert {"cable_compliance", "guide_azimuth"} <= set(installed_mechanisms(robot))
     wide, narrow = (priors_of(installed_priors(robot, None, None, known)) for known in (["segment_azimuths"], []))
     assert wide["guide_azimuth_error"] == 5 * narrow["guide_azimuth_error"]
+    assert "guide_azimuth" not in installed_mechanisms(several(command_unit="m", pairs=True))
     forces = several(command_unit="N")
     assert not {"cable_compliance", "guide_azimuth"} & {*installed_mechanisms(forces), *installed_mechanisms(arm())}
 
