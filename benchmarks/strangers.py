@@ -1,0 +1,287 @@
+"""What does an audit find in the files of a laboratory that nobody knows? Arms, files and effects are drawn at random.
+
+    python benchmarks/strangers.py SEED ... [--out reports/strangers] [--runs runs/strangers]
+
+For each seed: an outline (length, taper, segments, cables, gravity), recordings of it under random commands with an
+effect of the library hidden, and CSV files in units and a frame of their own. Then the commands of the README are
+typed, from init to audit, and a line of OUT/ledger.jsonl says what was hidden and what the audit named. A seed whose
+line is there is not run again. The recordings come from our engine, with other time steps and elements than init
+chooses. An arm takes 3 to 20 minutes of a processor (yardstick 2.4).
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import shlex
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from fifteen_minutes import typed
+
+import rfdropo_bayes as rb
+from rfdropo_bayes.files import append_line, read_lines
+
+NOTHING = "nothing"
+EFFECTS = (
+    NOTHING,
+    "command_delay",
+    "actuator_lag",
+    "cable_gain",
+    NOTHING,
+    "cable_slack",
+    "backlash",
+    "payload",
+    "stiffness_gradient",
+    NOTHING,
+    "base_tilt",
+    "base_compliance",
+    "viscoelasticity",
+    "coulomb_friction",
+    NOTHING,
+    "capstan_friction",
+    "softening",
+    "plane_anisotropy",
+    "marker_offset",
+    NOTHING,
+    "camera_scale",
+    "clock_offset",
+    "drive_zero_drift",
+    "cable_gain_drift",
+)
+"""Hidden in turn, by seed: effects that init does not put into the model, and nothing in one arm of five."""
+SIZE = 3.0  # root mean square of what an effect moves the markers by, in deviations of the noise
+NEAR = 0.2  # relative tolerance of it
+TRIES = 8  # of the search for a size
+MINUTES = 15  # of an audit, at most
+
+
+class Laboratory(NamedTuple):
+    """An arm and how it is recorded.
+
+    Attributes:
+        outline: arguments of `Robot.outline`.
+        damping: stiffness damping [s].
+        ramp: time that drives take for a change [s], which the laboratory writes into the robot file.
+        walk: random commands.
+        noise: standard deviation of positions [m].
+        unit: of commands: "mm", "deg" or "counts"; spool: radius [m] of the spools.
+    """
+
+    outline: dict[str, Any]
+    damping: float
+    ramp: float
+    walk: dict[str, Any]
+    noise: float
+    unit: str
+    spool: float
+
+
+def draw_laboratory(rng: np.random.Generator) -> Laboratory:
+    """Draw an arm that bears itself, moves at 1 to 4 Hz, and follows commands within its bending range."""
+    length = float(np.exp(rng.uniform(np.log(0.08), np.log(0.6))))
+    radius, cone = length * float(rng.uniform(0.03, 0.09)), bool(rng.random() < 0.5)
+    gravity = str(rng.choice(["+z", "+z", "-z", "+x", "-y"]))
+    mass = float(np.pi * radius**2 * length * rng.uniform(750.0, 1180.0)) * (0.58 if cone else 1.0)
+    area_moment, line = np.pi * radius**4 / 4.0, mass / length
+    frequency = float(np.exp(rng.uniform(np.log(1.0), np.log(4.0))))
+    # A cantilever of this frequency; of a third of the weight under which it buckles, or an eighth of L^3 / (E I).
+    by_motion = (2.0 * np.pi * frequency / 3.516) ** 2 * line * length**4 / area_moment
+    by_weight = line * 9.81 * length**3 / (3.0 if gravity == "-z" else 8.0) / area_moment
+    segments, markers = int(rng.choice([1, 1, 2])), int(rng.integers(1, 4))
+    heights = [*np.sort(rng.uniform(0.3, 0.85, markers - 1)), 1.0]
+    outline = {
+        "length": length,
+        "radius": radius,
+        "segments": segments,
+        "cables": int(rng.choice([3, 4])),
+        "shape": "cone" if cone else "cylinder",
+        "gravity": gravity,
+        "mass": mass,
+        "markers": {f"m{k + 1}": float(length * h) for k, h in enumerate(heights)},
+        "young_modulus": max(by_motion, by_weight),
+        **({"tip_radius": 0.5 * radius} if cone else {}),
+    }
+    most = 0.12 * length * float(rng.uniform(0.5, 1.0)) / segments
+    rate, number = float(rng.choice([20.0, 30.0, 50.0])), int(rng.choice([3, 4]))
+    walk = {
+        "duration": float(rng.choice([8.0, 12.0])),
+        "interval": float(rng.choice([0.3, 0.5])),
+        "step": 0.35 * most,
+        "low": 0.0,
+        "high": most,
+        "sample_time": 1.0 / rate,
+        "recordings": [str(k) for k in range(number)],
+    }
+    noise = length * float(np.exp(rng.uniform(np.log(5e-4), np.log(2e-3))))
+    unit, spool = str(rng.choice(["mm", "counts", "deg"])), float(rng.uniform(0.006, 0.02))
+    damping, ramp = float(rng.uniform(0.02, 0.08)), round(float(rng.uniform(0.05, 0.15)), 3)
+    return Laboratory(outline, damping, ramp, walk, noise, unit, spool)
+
+
+class Recorded(NamedTuple):
+    """Recordings, true values of the parameters, and the share of `SIZE` that the effect has."""
+
+    runs: Sequence[rb.Trajectory]
+    truth: dict[str, float]
+    size: float
+
+
+def record(own: Laboratory, effect: str, seed: int) -> Recorded:
+    """Recordings with an effect that moves the markers by `SIZE` deviations of the noise.
+
+    Raises:
+        RuntimeError: no size does.
+    """
+    rng = np.random.default_rng([seed, 2])
+    outlined = rb.Robot.outline(name="arm", **own.outline)
+    arm = outlined.with_changes(command=outlined.command.model_copy(update={"ramp_s": own.ramp}))
+    settings: dict[str, Any] = {
+        "priors": {"young_modulus": {}},
+        "simulator": {"time_step": 0.004},
+        "fixed": {"rayleigh_stiffness": own.damping},
+    }
+    plain, base = rb.Model(arm, **settings), {"young_modulus": own.outline["young_modulus"]}
+
+    def played(model: rb.Model, values: dict[str, float], noise: float) -> Sequence[rb.Trajectory]:
+        given = {"parameters": values, "noise": {"standard_deviation": noise}, "seed": seed}
+        return rb.simulate(model, own.walk, **given)
+
+    if effect == NOTHING:
+        return Recorded(played(plain, base, own.noise), base, 0.0)
+    model = rb.Model(arm, mechanisms=[effect], **settings)
+    priors = {n: p for n, p in model.parameters.prior.items() if p is not None and n not in plain.parameters.index}
+    signs = {name: float(rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.0)) for name in priors}
+    still, factor = played(plain, base, 1e-9), 1.0
+    for _ in range(TRIES):
+        values = base | {name: drawn(prior, signs[name], factor) for name, prior in priors.items()}
+        try:
+            moved = played(model, values, 1e-9)
+        except rb.InputError:  # beyond what the arm bears
+            factor *= 0.3
+            continue
+        change = np.concatenate([(a.position - b.position).ravel() for a, b in zip(moved, still, strict=True)])
+        size = float(np.sqrt(np.mean(change**2))) / own.noise / SIZE
+        if abs(size - 1.0) < NEAR:
+            return Recorded(played(model, values, own.noise), values, size)
+        factor = float(np.clip(factor * np.clip(1.0 / max(size, 1e-9), 0.1, 8.0), 1e-3, 8.0))
+    raise RuntimeError(f"seed {seed}: no size of {effect} moves the markers by {SIZE} deviations")
+
+
+def drawn(prior: dict[str, Any], sign: float, factor: float) -> float:
+    """A value of a parameter: ``factor`` deviations of its prior from the null, or the middle of a scale's prior."""
+    if prior["distribution"] == "LogNormal":
+        return float(prior["median"])
+    if prior["distribution"] == "Uniform":
+        return float(0.5 * (prior["low"] + prior["high"]))
+    one_sided = prior["distribution"] == "HalfNormal"
+    return float(prior.get("loc", 0.0) + (abs(sign) if one_sided else sign) * factor * prior["scale"])
+
+
+def write_files(own: Laboratory, runs: Sequence[rb.Trajectory], seed: int, folder: Path) -> str:
+    """Write CSV files in a frame and units of the laboratory; the options of ``rfdropo init``."""
+    rng = np.random.default_rng([seed, 3])
+    turn = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)
+    turn[0] *= np.sign(np.linalg.det(turn))
+    clamp, turns = rng.uniform(-500.0, 500.0, 3), 1.0 / (2.0 * np.pi * own.spool)
+    scales = {"mm": 1e3, "deg": 360.0 * turns, "counts": 4096.0 * turns}
+    folder.mkdir(parents=True)
+    for number, run in enumerate(runs, 1):
+        row = np.maximum(np.searchsorted(run.command_time, run.time + 1e-9) - 1, 0)
+        sent = (run.command[row] * scales[own.unit]).round(0 if own.unit == "counts" else 3)
+        frame = pd.DataFrame({"time": run.time.round(5)})
+        for motor, column in enumerate(sent.T, 1):
+            frame[f"motor{motor}_{own.unit}"] = column
+        seen = (1e3 * run.position @ turn.T + clamp).round(3)
+        for marker, name in enumerate(own.outline["markers"]):
+            frame[[f"{name}_{axis}" for axis in "xyz"]] = seen[:, marker]
+        frame.to_csv(folder / f"rec{number:02d}.csv", index=False)
+    told = own.outline
+    options = {
+        "length-mm": f"{1e3 * told['length']:.6g}",
+        "radius-mm": f"{1e3 * told['radius']:.3g}",
+        "segments": told["segments"],
+        "cables": told["cables"],
+        "mass-g": f"{1e3 * told['mass']:.3g}",
+        "gravity": told["gravity"],
+        "shape": told["shape"],
+        "markers": ",".join(f"{name}={1e3 * height:.6g}" for name, height in told["markers"].items()),
+    }
+    options |= {"tip-radius-mm": f"{1e3 * told['tip_radius']:.3g}"} if "tip_radius" in told else {}
+    options |= {"counts-per-turn": 4096} if own.unit == "counts" else {}
+    options |= {"spool-radius-mm": f"{1e3 * own.spool:.4g}"} if own.unit != "mm" else {}
+    return " ".join(f"--{name}={value}" for name, value in options.items())
+
+
+def audited(seed: int, folder: Path) -> dict[str, Any]:
+    """Draw, record, type the README's commands; what was hidden and what was said."""
+    own = draw_laboratory(np.random.default_rng([seed, 1]))
+    effect = EFFECTS[seed % len(EFFECTS)]
+    recorded = record(own, effect, seed)
+    options = write_files(own, recorded.runs, seed, folder / "data")
+    steps = [typed(f'rfdropo init arm --recording "data/*.csv" {options} --defaults', folder)]
+    robot = folder / "arm/arm.toml"
+    text = robot.read_text(encoding="utf-8")
+    robot.write_text(text.replace("ramp_s = 0.0", f"ramp_s = {own.ramp}"), encoding="utf-8")
+    commands = (
+        "rfdropo check arm/experiment.toml",
+        "rfdropo calibrate arm/experiment.toml --out runs/arm",
+        f"rfdropo audit arm/experiment.toml --from runs/arm --out runs/audit --set audit.minutes={MINUTES}",
+    )
+    steps += [typed(command, folder) for command in commands]
+    audit = json.loads((folder / "runs/audit/audit.json").read_text(encoding="utf-8"))
+    summary = json.loads((folder / "runs/arm/summary.json").read_text(encoding="utf-8"))
+    sizes = {n: row["mean"] for finding in audit["findings"] for n, row in finding["parameters"].items()}
+    return {
+        "hidden": effect,
+        "share_of_size": round(recorded.size, 3),
+        "truth": recorded.truth,
+        "outline": own.outline,
+        "walk": own.walk,
+        "noise": own.noise,
+        "damping": own.damping,
+        "ramp": own.ramp,
+        "unit": own.unit,
+        "verdict": audit["verdict"],
+        "named": [finding["mechanism"] for finding in audit["findings"]],
+        "classes": [finding["equivalence_class"] for finding in audit["findings"]],
+        "sizes": sizes,
+        "sentence": audit["sentence"],
+        "fit_mm": [*summary["rmse"]["fit"].values()][-1],
+        "test_mm": [*summary["rmse"]["test"].values()][-1],
+        "draws": summary["effective_draws"],
+        "randomisation": summary["randomisation"]["verdict"],
+        "wall_s": {shlex.split(step.command)[1]: round(step.wall) for step in steps},
+        "processor_s": {shlex.split(step.command)[1]: round(step.cpu) for step in steps},
+    }
+
+
+def main() -> None:
+    """Run the seeds that the ledger does not have yet."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seeds", nargs="+", type=int, metavar="SEED")
+    parser.add_argument("--out", type=Path, default=Path("reports/strangers"))
+    parser.add_argument("--runs", type=Path, default=Path("runs/strangers"))
+    given = parser.parse_args()
+    ledger = given.out / "ledger.jsonl"
+    ledger.parent.mkdir(parents=True, exist_ok=True)
+    known = {line["seed"] for line in read_lines(ledger)}
+    for seed in given.seeds:
+        if seed not in known:
+            folder = given.runs / str(seed)
+            shutil.rmtree(folder, ignore_errors=True)
+            row = audited(seed, folder)
+            append_line(ledger, json.dumps({"seed": seed, **row}))
+            print(f"{seed}: {row['hidden']} is hidden; {row['sentence']}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
