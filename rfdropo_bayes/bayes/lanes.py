@@ -23,8 +23,8 @@ from rfdropo_bayes.simulators.protocol import Simulator
 # Lanes of one call of an audit: a compilation costs more than the padding of a call, so that there is one size. Calls
 # with few different lanes are the most frequent.
 WIDTH = 8 * max(available_processors(), 2)
-# Step of a derivative of a compiled engine to both sides, in prior deviations. A delay of .07 s is known to 4e-5 s, and
-# a fit with steps of 1e-2 (a millisecond) ends 1.5e-4 s beside it. Rounding of 1e-13 m errs by 1e-9 m a deviation, the
+# Step of a derivative of a compiled engine to one side, in prior deviations; a larger step is taken to both sides. A
+# delay of .07 s is known to 4e-5 s, and a fit with steps of 1e-2 (a millisecond) ends 1.5e-4 s beside it. Rounding of 1e-13 m errs by 1e-9 m a deviation, the
 # last iteration of an equilibrium by 1e-6 m.
 STEP = 1e-4
 COARSE = 0.03  # the same for an engine in single precision, whose rounding is 1e-5 m
@@ -95,7 +95,9 @@ class Lanes:
     @property
     def slope_rollouts(self) -> int:
         """Rollouts per derivative, beside those of the value."""
-        return 3 if self.difference is None else 2
+        if self.difference is None:
+            return 3
+        return 1 if self.difference <= STEP else 2
 
     @property
     def later(self) -> float:

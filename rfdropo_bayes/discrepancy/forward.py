@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.bayes.channels.object_pose import OFFSETS
-from rfdropo_bayes.bayes.lanes import Fields, Lanes
+from rfdropo_bayes.bayes.lanes import STEP, Fields, Lanes
 from rfdropo_bayes.discrepancy.coordinates import Coordinates
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.journal import digest
@@ -186,11 +186,14 @@ class Forward:
         return shown
 
     def _differences(self, points: Points, directions: Points, step: float) -> Fields:
-        """Differences over a step in prior deviations to both sides, at bounds to one; zero if a rollout fails."""
+        """Differences over a step in prior deviations: to one side if it is small, and at bounds; zero if a rollout
+        fails.
+        """
         low, high = self.coordinates.bounds
         size = step / np.maximum(np.abs(directions / self.coordinates.prior_sd).max(axis=1), np.finfo(float).tiny)
         move = size[:, None] * directions
         ahead, behind = (((x >= low) & (x <= high)).all(axis=1) for x in (points + move, points - move))
+        behind &= ~ahead | (step > STEP)
         ends = np.concatenate([points - behind[:, None] * move, points + ahead[:, None] * move])
         seen, fine = self.observe(ends)
         usable = fine.reshape(2, -1).all(axis=0) & (ahead | behind)
