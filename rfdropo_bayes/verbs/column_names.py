@@ -37,12 +37,13 @@ TIME = re.compile(
 )
 AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
 MEASURED = re.compile(
-    r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
+    r"meas(ured)?|actual|present|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
 )
-SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)  # if any columns match, only they are commands
+AIMED = re.compile(r"goal|target|desired|(?<![a-z])(ref|reference|set)(?![a-z])", re.IGNORECASE)
+"""What a controller aims at: a command of its drives, or in x, y and z a place that the robot should reach."""
+SENT = re.compile(rf"cmd|command|action|setpoint|{AIMED.pattern}", re.IGNORECASE)
 COMMAND = re.compile(
-    r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
-    re.IGNORECASE,
+    rf"{SENT.pattern}|motor|servo|pull|cable|tendon|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)", re.IGNORECASE
 )
 NO_COMMAND = re.compile(
     r"(?<![a-z])(ids?|idx|index|frames?|seq|rows?|numbers?|nr|trial|episode|run|phase|pattern|label|flags?|status|mode|"
@@ -161,7 +162,7 @@ def guess_columns(
     }
     units["command_time_unit"] = command_time_unit(sending, clock, _seconds(whole, time, units["time_unit"].unit))
     angles, units["motor_angle_unit"] = _measured_angles(
-        whole, table, angles if len(angles) == len(commands) else [], units["command_unit"].unit
+        whole, table, angles if len(angles) == len(commands) else [], commands, units["command_unit"].unit
     )
     used = {*commands, *names_of(positions), *tensions, *angles}
     return Guess(
@@ -192,10 +193,16 @@ def guess_columns(
 def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[str], list[str], list[str]]:
     """Columns in x, y and z of each marker, of forces, of measured angles, and possible commands."""
     places = _array_triples(columns) if format in named_arrays.FORMATS else _triples(columns)
-    rest = [name for name in columns if SENT.search(name) or not any(name in triple for triple in places.values())]
+    placed = names_of(list(places.values()))
+    rest = [
+        name
+        for name in columns
+        if (SENT.search(name) or name not in placed) and not (AIMED.search(name) and AXIS.search(name))
+    ]
     tensions = [name for name in rest if FORCE.search(name)]
-    angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
-    return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *angles)]
+    read = [name for name in rest if MEASURED.search(name) and not SENT.search(name) and name not in tensions]
+    angles = [name for name in read if not (BESIDE.search(name) or RATE.search(name))]
+    return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *read)]
 
 
 def _check_columns(
@@ -213,13 +220,20 @@ def _check_columns(
             )
 
 
-def _measured_angles(whole: CsvTable, table: pd.DataFrame, angles: list[str], sent: str) -> tuple[list[str], Unit]:
-    """Columns of measured angles that are of use beside commands in the unit ``sent``, and their unit."""
-    if not angles:
-        return [], Unit("rad")
-    unit = unit_in_names(whole, angles, ANGLES) or angle_unit(table, angles)
-    if unit.others or (unit.unit == named_columns.COUNTS and sent not in ANGLES):
-        return [], Unit("rad")  # nothing would use them, and their size is not known
+def _measured_angles(
+    whole: CsvTable, table: pd.DataFrame, angles: list[str], commands: list[str], sent: str
+) -> tuple[list[str], Unit]:
+    """Columns of measured angles that are of use beside ``commands`` in the unit ``sent``, and their unit.
+
+    Without a unit of their own, readings that are called as the commands are in the unit of the commands.
+    """
+    unit = unit_in_names(whole, angles, ANGLES)
+    if unit is None and angles:
+        same = [_stem(name) for name in angles] == [_stem(name) for name in commands]
+        unit = Unit(sent, evidence=f"{angles[0]} is called as {commands[0]}") if same else angle_unit(table, angles)
+    useful = () if unit is None or unit.others else ANGLES if sent in ANGLES else ("deg", "rad")
+    if unit is None or unit.unit not in useful:
+        return [], Unit("rad")  # nothing would use them, or their size is not known
     return angles, unit
 
 
@@ -292,20 +306,31 @@ def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
 def _commands(table: pd.DataFrame, names: list[str], measured: list[str], *, any_name: bool) -> list[str]:
     """Columns of commands. If no name matches: all columns in files of a user's own format, or the ``measured`` angles
     or forces of drives whose commands nobody recorded.
+
+    Of aims and other columns that are called commands, one kind is meant: the larger, the others if there are as many.
+    Other columns that are called as the aims are read back.
     """
-    sent = [name for name in names if SENT.search(name)]
+    sent = [name for name in names if SENT.search(AIMED.sub("", name))]
     names = sent or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
     turns = {name for four in _quaternions(table, names) for name in four}
     names = [name for name in names if name not in turns]
     called = [name for name in names if COMMAND.search(name)]
+    driven = [name for name in called if not BESIDE.search(name) and not RATE.search(name)]
+    aims = [name for name in driven if AIMED.search(name)]
+    others = [name for name in driven if name not in aims and _stem(name) not in map(_stem, aims)]
     return (
-        [name for name in names if SENT.search(name) and not RATE.search(name)]
-        or [name for name in called if not BESIDE.search(name) and not RATE.search(name)]
+        [name for name in names if sent and not RATE.search(name)]
+        or max(others, aims, key=len)
         or called
         or ([name for name in names if not BESIDE.search(name)] if any_name else [])
         or measured
         or (names if any_name else [])
     )
+
+
+def _stem(name: str) -> str:
+    """A name without the words that tell what was sent from what was measured: of the same motor, it is the same."""
+    return "".join(WORD.findall(SENT.sub("", MEASURED.sub("", name)).lower()))
 
 
 def _counts_rows(values: pd.Series) -> bool:

@@ -79,6 +79,47 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.unused == ["battery"]
 
 
+@pytest.mark.parametrize(
+    ("sent", "read", "unit", "angles"),
+    [
+        ("goal_position_{0}", "present_position_{0}", "counts", 4),
+        ("theta_des_{0}", "theta_{0}_meas", "rad", 4),
+        ("l{0}_ref", "l{0}_meas", "mm", 0),
+        ("desired_{0}", "actual_{0}", "mm", 0),
+        ("p{0}_set_kPa", "p{0}_meas_kPa", "kPa", 0),
+        ("pull_{0}_target", "pull_{0}", "mm", 0),
+    ],
+)
+def test_what_was_sent_is_told_from_what_was_measured(tmp_path, sent, read, unit, angles):
+    """Readings are in the unit of the commands that they are called after, and of use if that is an angle."""
+    run = table("t", "{marker}_{axis}", sent)
+    size = 4000.0 if unit == "counts" else 10.0
+    for k in range(1, 5):
+        run[sent.format(k)] = (size * run[sent.format(k)]).round().astype(int)
+        run[read.format(k)] = run[sent.format(k)]
+        run[f"present_current_{k}"] = run[f"present_velocity_{k}"] = 0.1
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.commands, guess.command_unit) == ([sent.format(k) for k in range(1, 5)], unit)
+    assert guess.motor_angles == [read.format(k) for k in range(1, 5)][:angles]
+    assert not angles or guess.motor_angle_unit == unit
+    assert not guess.reads_drives
+
+
+@pytest.mark.parametrize("command", ["cmd_{0}", "u{0}", "north{0}"])
+@pytest.mark.parametrize("aim", ["target_{0}", "{0}_ref", "goal.{0}", "tip_desired_{0}"])
+@pytest.mark.parametrize("axes", ["xyz", "xy"])
+def test_a_place_that_a_controller_aims_at_is_neither_a_marker_nor_a_command(tmp_path, command, aim, axes):
+    run = table("t", "{marker}_{axis}", command)
+    for axis in axes:
+        run[aim.format(axis)] = np.sin(TIME)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert guess.markers == ["low", "tip"]
+    assert guess.commands == [command.format(k) for k in range(1, 5)]
+    assert guess.unused == [aim.format(axis) for axis in axes]
+
+
 def test_counters_that_begin_anew_are_read_on(tmp_path):
     run = table("t", "{marker}_{axis}", "enc{0}")
     turns = 3000.0 * np.sin(3.0 * TIME)
