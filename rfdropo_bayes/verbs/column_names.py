@@ -35,7 +35,7 @@ from rfdropo_bayes.verbs.column_units import (
 TIME = re.compile(
     r"^\W*(t|ts|time|timestamp|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock)(?![a-z])", re.IGNORECASE
 )
-AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
+AXIS = re.compile(r"(?:(?<![a-z])|(?<=[^a-z]p)|(?<=^p))[xyz](?![a-z])", re.IGNORECASE)  # as in x1, tip_x and tip_px
 MEASURED = re.compile(
     r"meas(ured)?|actual|present|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
 )
@@ -132,11 +132,13 @@ def guess_columns(
         names: column names of a CSV without names; command_names: the same for the commands' file.
 
     Raises:
-        InputError: a file that cannot be read, or in which no positions or commands are found.
+        InputError: a file that cannot be read, that has names and is given others, or in which no positions or
+            commands are found.
     """
     format = recognised_format(path)
     own = format == named_columns.FORMAT or format in named_arrays.FORMATS
     whole, unit = _measured(format, path, names)
+    _check_names(whole, names, "--names")
     table = whole.numeric(LOOKED_AT)
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
     columns = [str(name) for name in table.columns if name != time]
@@ -145,6 +147,7 @@ def guess_columns(
     source, sending, clock = table, whole, None
     if sent is not None:
         sending = CsvTable(sent, (), names=command_names, machine_written=False)
+        _check_names(sending, command_names, "--command-names")
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name != clock]
     measured = [] if sent is not None else angles or tensions
@@ -197,7 +200,7 @@ def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[
     rest = [
         name
         for name in columns
-        if (SENT.search(name) or name not in placed) and not (AIMED.search(name) and AXIS.search(name))
+        if (SENT.search(name) or name not in placed) and not (AIMED.search(name) and AXIS.search(_parted(name)))
     ]
     tensions = [name for name in rest if FORCE.search(name)]
     read = [name for name in rest if MEASURED.search(name) and not SENT.search(name) and name not in tensions]
@@ -205,14 +208,27 @@ def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[
     return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *read)]
 
 
+def _check_names(table: CsvTable, given: Sequence[str] | None, option: str) -> None:
+    own = [str(name) for name in table.frame.columns]
+    if given is not None and own != list(given):
+        raise InputError(
+            f"has names of its columns: {_shown(own)}",
+            where=str(table.path),
+            remedy=f"leave {option} out, or write the new names into the file",
+        )
+
+
+def _shown(names: list[str]) -> str:
+    return ", ".join(names[:MOST_SHOWN]) + (", ..." if len(names) > MOST_SHOWN else "")
+
+
 def _check_columns(
     path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]
 ) -> None:
     for what, names in (("positions (columns in x, y and z)", positions), ("commands", commands)):
         if not names:
-            shown = ", ".join(columns[:MOST_SHOWN]) + (", ..." if len(columns) > MOST_SHOWN else "")
             raise InputError(
-                f"found no {what} among the columns {shown}",
+                f"found no {what} among the columns {_shown(columns)}",
                 where=str(path),
                 remedy="give the CSV of the commands with --commands"
                 if format == motive_csv.FORMAT and positions
@@ -350,6 +366,11 @@ def _quaternions(table: pd.DataFrame, names: list[str]) -> list[list[str]]:
     return quaternions
 
 
+def _parted(name: str) -> str:
+    """A name whose words begin with capitals, such as tipX, with a low line between them."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+
+
 def names_of(positions: list[list[str]]) -> list[str]:
     """The columns of all markers."""
     return [name for triple in positions for name in triple]
@@ -359,8 +380,9 @@ def _triples(names: list[str]) -> dict[str, list[str]]:
     """Columns whose names differ in one letter, x, y or z: the common name, and the three columns in this order."""
     triples: dict[str, dict[str, str]] = {}
     for name in names:
-        for match in AXIS.finditer(name):
-            common = f"{name[: match.start()]}*{name[match.end() :]}".lower()
+        words = _parted(name)
+        for match in AXIS.finditer(words):
+            common = f"{words[: match.start()]}*{words[match.end() :]}".lower()
             triples.setdefault(common, {})[match[0].lower()] = name
     return {common: [axes[a] for a in "xyz"] for common, axes in triples.items() if set(axes) == set("xyz")}
 

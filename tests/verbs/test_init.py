@@ -43,6 +43,8 @@ def table(time: str, position: str, command: str, scale: float = 1.0, factor: fl
         ("Zeit [s]", "{marker} {axis} [mm]", "Motor {0} [deg]", 1.0, ("s", "deg", "mm"), ["low", "tip"]),
         ("Time_s", "{marker}_{axis}_mm", "M{0}_cmd_counts", 1.0, ("s", "counts", "mm"), ["low", "tip"]),
         ("t", "{marker}_{axis}_mm", "axis {0} (ticks)", 1.0, ("s", "counts", "mm"), ["low", "tip"]),
+        ("t", "{marker}_p{axis}", "motor{0} [rad]", 1.0, ("s", "rad", "mm"), ["low_p", "tip_p"]),
+        ("t", "p{axis}_{marker}", "motor{0} [rad]", 1.0, ("s", "rad", "mm"), ["p_low", "p_tip"]),
     ],
 )
 def test_columns_are_recognised_by_their_names(tmp_path, time, position, command, scale, units, markers):
@@ -56,6 +58,20 @@ def test_columns_are_recognised_by_their_names(tmp_path, time, position, command
     assert guess.commands == [command.format(k) for k in range(1, 5)]
     assert [len(triple) for triple in guess.positions] == [3, 3]
     assert guess.markers == markers
+
+
+def test_capitals_begin_words(tmp_path):
+    run = table("t", "{marker}_{axis}", "motorCmd{0}")
+    run = run.rename(
+        columns={f"{marker}_{axis}": f"{marker}{axis.upper()}" for marker in ("low", "tip") for axis in "xyz"}
+    )
+    for name in ("gyroX", "gyroY", "gyroZ", "targetX", "targetY", "targetZ", "tipVX", "tipVY", "tipVZ"):
+        run[name] = np.sin(TIME)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert guess.positions == [["lowX", "lowY", "lowZ"], ["tipX", "tipY", "tipZ"]]
+    assert guess.markers == ["low", "tip"]
+    assert guess.commands == [f"motorCmd{k}" for k in range(1, 5)]
 
 
 def test_semicolons_decimal_commas_and_compression_are_seen_through(tmp_path):
@@ -402,6 +418,13 @@ def test_a_file_without_names_is_read_by_the_names_that_init_suggests(tmp_path, 
     assert status == 2
     suggested = "t,c1,c2,c3,c4,low_x,low_y,low_z,tip_x,tip_y,tip_z"
     assert f'if they are in this order, write {suggested} above it, or give --names "{suggested}"' in told
+    run.to_csv(tmp_path / "named.csv", index=False)
+    for option in ("--names", "--command-names"):
+        named = ("--recording", "named.csv", "--commands", "named.csv", option, suggested)
+        status, told = init(monkeypatch, capsys, "arm", *named)
+        assert status == 2
+        assert "named.csv: has names of its columns: t, u1, u2, u3, u4, low_x, low_y" in told
+        assert f"leave {option} out" in told
     assert init(monkeypatch, capsys, "arm", *words, "--names", suggested)[0] == 0
     experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
     (read,) = load_recordings(experiment.data, tmp_path / "arm")
