@@ -20,6 +20,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.verbs.column_units import (
     ANGLES,
     FORCE,
+    FOREIGN,
+    PRESSURE,
     UNITS,
     WORD,
     Unit,
@@ -33,8 +35,11 @@ from rfdropo_bayes.verbs.column_units import (
 )
 
 TIME = re.compile(
-    r"^\W*(t|ts|time|timestamp|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock)(?![a-z])", re.IGNORECASE
+    r"(?<![a-z])(t(?![ _\[]?\d)|ts|times?|timestamps?|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock|"
+    r"zeit|tiempo|tempo|时间|時間)(?![a-z])",
+    re.IGNORECASE,
 )
+"""Names of times. Columns t1, t2, ... are anything but times."""
 AXIS = re.compile(r"(?:(?<![a-z])|(?<=[^a-z]p)|(?<=^p))[xyz](?![a-z])", re.IGNORECASE)  # as in x1, tip_x and tip_px
 MEASURED = re.compile(
     r"meas(ured)?|actual|present|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
@@ -72,6 +77,8 @@ STRUCTURE = re.compile(
 """Words that formats put around the name of a marker."""
 LOOKED_AT = 2000  # rows that sizes are taken from
 MOST_SHOWN = 12  # columns that an error names; and rows from which a pattern of values is told
+EVEN = "no column is called a time, and this one alone rises evenly from row to row"
+MOSTLY, UNEVEN = 0.9, 0.5  # share of the steps of a clock that go on, and by how much of the usual step they may differ
 UNIT_LENGTH = 1e-3  # by how much the length of a quaternion may differ from one
 
 
@@ -141,6 +148,8 @@ def guess_columns(
     _check_names(whole, names, "--names")
     table = whole.numeric(LOOKED_AT)
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
+    even = _even_clock(table) if time is None and own else None
+    time = time or even
     columns = [str(name) for name in table.columns if name != time]
     triples, tensions, angles, free = _parts(columns, format)
     positions = list(triples.values())
@@ -181,7 +190,8 @@ def guess_columns(
         units={**units["command_unit"].others, **units["position_unit"].others},
         names=None if names is None else list(names),
         command_names=None if command_names is None else list(command_names),
-        evidence={key: unit.evidence for key, unit in units.items() if unit.evidence},
+        evidence=({"time": EVEN} if even else {})
+        | {key: unit.evidence for key, unit in units.items() if unit.evidence},
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
         sent=source[commands].to_numpy(dtype=float),
         seen=table[names_of(positions)].to_numpy(dtype=float).reshape(len(table), -1, 3),
@@ -301,10 +311,26 @@ def _measured(format: str, path: Path, names: Sequence[str] | None) -> tuple[Csv
 
 
 def _clock_of(table: CsvTable) -> str | None:
-    """The first column that is called a time and holds times; else the first in a unit of time that always rises."""
+    """The first column whose name begins with a word for a time and that holds times; else the first with such a word
+    or a unit of time in its name that rises: times that something took rise and fall."""
     names = [str(name) for name in table.frame.columns]
-    called = next((name for name in names if TIME.search(name) and _holds_times(table, name)), None)
-    return called or next((name for name in names if time_units_in_names(table, name) and _rises(table, name)), None)
+    called = {name: _parted(name) for name in names if TIME.search(_parted(name))}
+    first = (name for name, words in called.items() if TIME.match(words.lstrip("%#/_ ")) and _holds_times(table, name))
+    rising = (name for name in names if (name in called or time_units_in_names(table, name)) and _rises(table, name))
+    return next(first, None) or next(rising, None)
+
+
+def _even_clock(table: pd.DataFrame) -> str | None:
+    """The only column that rises evenly, if its name does not say that it is anything else."""
+    found = [str(name) for name in table.columns if not _told(str(name)) and _rises_evenly(table[name])]
+    return found[0] if len(found) == 1 else None
+
+
+def _told(name: str) -> bool:
+    """Whether a name or the unit in it says that a column is something else than a time."""
+    words = _parted(name)
+    parts = (COMMAND, MEASURED, FORCE, BESIDE, NO_COMMAND, PRESSURE, AXIS, *FOREIGN.values())
+    return any(part.search(words) for part in parts) or not UNITS.keys().isdisjoint(WORD.findall(words.lower()))
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
@@ -327,7 +353,7 @@ def _commands(table: pd.DataFrame, names: list[str], measured: list[str], *, any
     Other columns that are called as the aims are read back.
     """
     sent = [name for name in names if SENT.search(AIMED.sub("", name))]
-    names = sent or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
+    names = sent or [name for name in names if not (NO_COMMAND.search(name) or _numbers_rows(table[name], name))]
     turns = {name for four in _quaternions(table, names) for name in four}
     names = [name for name in names if name not in turns]
     called = [name for name in names if COMMAND.search(name)]
@@ -349,9 +375,17 @@ def _stem(name: str) -> str:
     return "".join(WORD.findall(SENT.sub("", MEASURED.sub("", name)).lower()))
 
 
-def _counts_rows(values: pd.Series) -> bool:
-    """Whether a column goes up by one from every row to the next."""
-    return len(values) > MOST_SHOWN and bool((values.diff().iloc[1:] == 1.0).all())
+def _numbers_rows(values: pd.Series, name: str) -> bool:
+    """Whether a column goes up by one from every row to the next, or evenly, as times do, if its name allows times."""
+    by_one = len(values) > MOST_SHOWN and bool((values.diff().iloc[1:] == 1.0).all())
+    return by_one or (_rises_evenly(values) and not _told(name))
+
+
+def _rises_evenly(values: pd.Series) -> bool:
+    """Whether a column goes up from every row to the next, mostly by the usual step, and not by one as numbers do."""
+    steps = values.diff().iloc[1:]
+    usual = (steps / steps.median() - 1.0).abs() < UNEVEN
+    return len(values) > MOST_SHOWN and bool((steps > 0.0).all() and usual.mean() > MOSTLY and (steps != 1.0).any())
 
 
 def _quaternions(table: pd.DataFrame, names: list[str]) -> list[list[str]]:
@@ -413,11 +447,22 @@ def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list
 
 
 def _holds_times(table: CsvTable, name: str) -> bool:
+    ticks = _ticks(table, name)
+    return len(ticks) == 1 or bool(len(ticks) > 1 and ticks[-1] != ticks[0])  # a date without a time of day is no clock
+
+
+def _rises(table: CsvTable, name: str) -> bool:
+    """Whether a column holds times that never fall and mostly grow from row to row."""
+    steps = np.diff(_ticks(table, name))
+    return len(steps) > 0 and bool((steps >= 0).all() and np.mean(steps > 0) > MOSTLY)
+
+
+def _ticks(table: CsvTable, name: str) -> np.ndarray:
+    """Times of the rows, as they are written; empty if a cell holds none."""
     try:
-        ticks = table.stamps(name, "s").ticks
+        return table.stamps(name, "s").ticks
     except InputError:
-        return False
-    return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date without a time of day is no clock
+        return np.zeros(0)
 
 
 def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
@@ -426,9 +471,3 @@ def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
         return 0.0
     stamps = table.stamps(time, unit)
     return float(stamps.ticks[-1] - stamps.ticks[0]) / stamps.per_second
-
-
-def _rises(table: CsvTable, name: str) -> bool:
-    """Whether a column grows from every row to the next."""
-    numbers = table.numeric(LOOKED_AT)
-    return len(numbers) > 1 and name in numbers and bool((numbers[name].diff().iloc[1:] > 0.0).all())

@@ -96,10 +96,11 @@ def matching_commands(patterns: list[str], recordings: list[Path]) -> list[Path]
 def with_given(guess: Guess, **given: Any) -> Guess:
     """A guess with given values in place of guessed values: units, and the time from row to row [s]."""
     given = {key: value for key, value in given.items() if value is not None}
-    evidence = {key: words for key, words in guess.evidence.items() if key not in given}
+    settled = {*given, *(("time", "time_unit") if "sample_time" in given else ())}
+    evidence = {key: words for key, words in guess.evidence.items() if key not in settled}
     of_others = {"command_unit": guess.commands, "position_unit": names_of(guess.positions)}
-    settled = [name for key, names in of_others.items() if key in given for name in names]
-    units = {name: unit for name, unit in guess.units.items() if name not in settled}
+    same = [name for key, names in of_others.items() if key in given for name in names]
+    units = {name: unit for name, unit in guess.units.items() if name not in same}
     return guess._replace(**given, evidence=evidence, units=units)
 
 
@@ -358,7 +359,7 @@ def _entries(
 
 def assumed_of_columns(guess: Guess) -> list[str]:
     """Assumptions and omissions of `data_tables` that no recording can settle; a sentence each."""
-    said = [f'{key} = "{getattr(guess, key)}": {words}' for key, words in guess.evidence.items()]
+    said = [f"{key} = {quoted(getattr(guess, key))}: {words}" for key, words in guess.evidence.items()]
     if guess.time is None and guess.sample_time is None:
         said.append(f'time = "{ROWS}": {NO_TIMES}')
     if guess.command_time is not None:
@@ -401,7 +402,7 @@ def data_tables(
     optional = [f"tensions = {quoted(guess.tensions)}"] if guess.tensions else []
     optional = [f"cables = {quoted(list(cables))}"] * bool(optional and cables) + optional
     if guess.motor_angles:
-        optional += [f"motor_angles = {quoted(guess.motor_angles)}", _unit_line(guess, "motor_angle_unit")]
+        optional += [f"motor_angles = {quoted(guess.motor_angles)}", _guessed_line(guess, "motor_angle_unit")]
     counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
     wraps = ", ".join(f"{quoted_key(name)} = {turn:.10g}" for name, turn in guess.unwrap.items())
     if wraps:
@@ -422,7 +423,7 @@ def data_tables(
         *_clock(guess),
         f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order"
         + (f"; ASSUMED: {order}" if order else ""),
-        _unit_line(guess, "command_unit"),
+        _guessed_line(guess, "command_unit"),
         *counts,
         *_other_units(guess),
         *_command_clock(guess),
@@ -430,7 +431,7 @@ def data_tables(
         "positions = [",
         *(f"    {quoted(triple)}," for triple in guess.positions),
         "]",
-        _unit_line(guess, "position_unit"),
+        _guessed_line(guess, "position_unit"),
         f"markers = {quoted(list(markers))}  # the robot's names, in the order of positions",
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
         *(frame or [f"axes = {quoted(axes)}{assumed}"]),
@@ -440,10 +441,10 @@ def data_tables(
     ]
 
 
-def _unit_line(guess: Guess, key: str) -> str:
-    """The line of a unit, with the evidence of one that was guessed."""
+def _guessed_line(guess: Guess, key: str) -> str:
+    """The line of a unit or column, with the evidence of one that was guessed."""
     evidence = guess.evidence.get(key)
-    return f'{key} = "{getattr(guess, key)}"' + (f"  # ASSUMED: {evidence}" if evidence else "")
+    return f"{key} = {quoted(getattr(guess, key))}" + (f"  # ASSUMED: {evidence}" if evidence else "")
 
 
 def _other_units(guess: Guess) -> list[str]:
@@ -461,7 +462,7 @@ def _clock(guess: Guess) -> list[str]:
         return [f'time = "{ROWS}"  # ASSUMED: {NO_TIMES}']
     if guess.format == rosbag.FORMAT:
         return ['time = "header"  # stamps if messages have them; "log": the times at which they were received']
-    return [f"time = {quoted(guess.time)}", _unit_line(guess, "time_unit")]
+    return [_guessed_line(guess, "time"), _guessed_line(guess, "time_unit")]
 
 
 def _command_clock(guess: Guess) -> list[str]:
@@ -470,7 +471,7 @@ def _command_clock(guess: Guess) -> list[str]:
         return []
     return [
         f"command_time = {quoted(guess.command_time)}",
-        _unit_line(guess, "command_time_unit"),
+        _guessed_line(guess, "command_time_unit"),
         "# ASSUMED: both clocks begin together. Else: reading of the observations' clock [s] when the "
         "commands' clock shows zero.",
         "command_offset = 0.0",

@@ -16,7 +16,7 @@ from rfdropo_bayes.model.experiment import load_experiment, matching
 from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_names import guess_columns, suggested_names
-from rfdropo_bayes.verbs.init import data_tables, with_counts, with_turns
+from rfdropo_bayes.verbs.init import data_tables, with_counts, with_given, with_turns
 
 ROWS = 40
 TIME = 0.05 * np.arange(ROWS)
@@ -171,9 +171,55 @@ def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(
     assert guess_columns(tmp_path / "run.csv").time is None
 
 
+@pytest.mark.parametrize(
+    ("name", "others"),
+    [
+        ("elapsed_time", {}),
+        ("ros_time", {"solve_time": np.abs(np.sin(TIME))}),
+        ("rosTime", {"header.stamp.nanosec": (1e9 * TIME % 1e9).astype(int), "header.stamp.sec": TIME.astype(int)}),
+        ("__time", {"t1": 3.0}),
+        ("times", {"loop_dt": 0.05}),
+        ("Zeit", {"t1": 20.0 * TIME, "t2": 1.0, "t3": 2.0}),
+        ("时间", {}),
+        ("run.t", {"run.tip_t": 20.0 + np.sin(TIME)}),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_times_are_called_so_anywhere_in_their_name(tmp_path, name, others, first):
+    run = table("t", "{marker}_{axis}", "motor{0}").rename(columns={"t": name})
+    for number, (other, value) in enumerate(others.items()):
+        run.insert(number if first else len(run.columns), other, value)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.time_unit) == (name, "s")
+    assert guess.unused == list(others)
+    assert "time" not in guess.evidence
+
+
+@pytest.mark.parametrize("command", ["motor{0}", "north{0}"])
+def test_a_column_that_rises_evenly_is_the_time_if_none_is_called_so_and_never_a_cable(tmp_path, command):
+    run = table("moment", "{marker}_{axis}", command)
+    run.loc[7:, "moment"] += 0.1  # two rows were lost
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.commands) == ("moment", [command.format(k) for k in range(1, 5)])
+    assert "rises evenly" in guess.evidence["time"]
+    lines = data_tables(tmp_path, ["low", "tip"], [], [], guess)
+    assert f'time = "moment"  # ASSUMED: {guess.evidence["time"]}' in lines
+    assert "time" not in with_given(guess, sample_time=0.05).evidence
+    for other in ({"t": TIME}, {"other": 3.0 * TIME}):
+        run.assign(**other).to_csv(tmp_path / "run.csv", index=False)
+        guess = guess_columns(tmp_path / "run.csv")
+        assert guess.time == ("t" if "t" in other else None)
+        assert guess.commands == [command.format(k) for k in range(1, 5)]
+    for counter in (5 + np.arange(ROWS), TIME**2, np.repeat(TIME[::2], 2)):
+        run.assign(moment=counter).to_csv(tmp_path / "run.csv", index=False)
+        assert guess_columns(tmp_path / "run.csv").time is None
+
+
 def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, monkeypatch, capsys):
     for number in (1, 2):
-        run = table("nummer", "{marker}_{axis}", "motor{0}")
+        run = table("nummer", "{marker}_{axis}", "motor{0}").assign(nummer=np.arange(ROWS))
         run.loc[3 * number : 8, ["low_x", "low_y", "low_z"]] = np.nan
         run.to_csv(tmp_path / f"Prüfung {number}.csv", index=False)
     monkeypatch.chdir(tmp_path)
