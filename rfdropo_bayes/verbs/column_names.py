@@ -193,7 +193,7 @@ def guess_columns(
         evidence=({"time": EVEN} if even else {})
         | {key: unit.evidence for key, unit in units.items() if unit.evidence},
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
-        sent=source[commands].to_numpy(dtype=float),
+        sent=source[commands].ffill().to_numpy(dtype=float),
         seen=table[names_of(positions)].to_numpy(dtype=float).reshape(len(table), -1, 3),
         time_unit=units["time_unit"].unit,
         command_unit=units["command_unit"].unit,

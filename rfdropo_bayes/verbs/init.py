@@ -181,8 +181,10 @@ def write_first_files(
     commands: list[Path],
     guess: Guess | None,
     kept: int = 0,
-) -> tuple[Path, Path]:
+) -> tuple[Path, Path, str]:
     """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
+
+    Returns both, and why no recording can be read, in words: frame, size and order of cables are then not found.
 
     Args:
         folder: folder to create and write to.
@@ -220,13 +222,13 @@ def write_first_files(
     days, zero = days_of(recordings), None
     if guess is None:
         write(_random_commands(outline))
-        return robot, experiment
+        return robot, experiment, ""
     known: dict[str, Any] = {"gravity": outline.gravity, "cables": outline.cable_names(), "kept": kept}
     tables = partial(data_tables, folder, outline.markers, recordings, commands, guess=guess, **known)
     plain = write(tables())
-    runs = _recordings(plain, folder)
+    runs, unread = _recordings(plain, folder)
     if not runs:
-        return robot, experiment
+        return robot, experiment, unread
     first = runs[0]
     if guess.reads_drives and guess.unwrap:  # the zero of a counter that wraps is anywhere in a turn
         zero = first.command.mean(axis=0)
@@ -247,10 +249,10 @@ def write_first_files(
     poses = None if guess.command_time is not None else poses
     tables = partial(tables, pieces=pieces, poses=poses)
     placed = write(tables(frame=frame), slow, first)
-    runs = _recordings(placed, folder)
+    runs, unread = _recordings(placed, folder)
     columns = None if placed.data is None else placed.data.columns
     if not runs or columns is None or not usual:
-        return robot, experiment
+        return robot, experiment, unread
     seen = runs[0]
     bends = outline.sets_bend is not None
     scaled, stiff = ("length" in outline.assumed), ("young_modulus" in outline.assumed)
@@ -286,7 +288,7 @@ def write_first_files(
             registration = registration._replace(frame=registration.frame._replace(shift=np.zeros(3)))
     gain = float(np.clip(registration.bend / registration.softness, *FORCES))
     write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame, gain)
-    return robot, experiment
+    return robot, experiment, unread
 
 
 def _of_poses(first: Trajectory, timed: bool) -> str | None:
@@ -300,14 +302,14 @@ def _of_poses(first: Trajectory, timed: bool) -> str | None:
     return f"a quadratic map of the commands of a pose's own row leaves {errors}"
 
 
-def _recordings(experiment: Experiment, folder: Path) -> list[Trajectory]:
-    """The recordings of fit and test; empty if one cannot be read: check reports the fault next."""
+def _recordings(experiment: Experiment, folder: Path) -> tuple[list[Trajectory], str]:
+    """The recordings of fit and test; if one cannot be read, none, and the reason."""
     if experiment.data is None:
-        return []
+        return [], ""
     try:
-        return [run for role in ROLES for run in load_recordings(experiment.data, folder, role)]
-    except InputError:
-        return []
+        return [run for role in ROLES for run in load_recordings(experiment.data, folder, role)], ""
+    except InputError as error:
+        return [], str(error)
 
 
 def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:

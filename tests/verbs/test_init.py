@@ -235,6 +235,18 @@ def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, mon
     assert int((~fitted.position_mask).sum()) == 6
 
 
+def test_a_recording_that_cannot_be_read_is_said_with_what_it_leaves_unknown(tmp_path, monkeypatch, capsys):
+    run = table("time", "{marker}_{axis}", "motor{0}")
+    run.loc[:4, "motor2"] = np.nan
+    run.to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "arm", "--recording", "run.csv")
+    assert status == 0
+    assert "run.csv, row 0, column 'motor2': the first command is in row 5" in told
+    assert "next: repair it, and run init again" in told
+    assert "rfdropo check" not in told
+
+
 def test_the_last_third_is_the_test_unless_recordings_are_named_for_it(tmp_path, monkeypatch, capsys):
     for number in range(1, 8):
         table("time", "{marker}_{axis}", "motor{0}").to_csv(tmp_path / f"run_{number}.csv", index=False)
