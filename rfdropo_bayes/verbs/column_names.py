@@ -161,7 +161,10 @@ def guess_columns(
         free = [str(name) for name in source.columns if name != clock]
     measured = [] if sent is not None else angles or tensions
     commands = _commands(source, free, measured, any_name=own or sent is not None)
-    _check_columns(path, format, columns, positions, commands)
+    if not positions:
+        raise _not_found(whole, time, format, "positions (columns in x, y and z)")
+    if not commands:
+        raise _not_found(sending, time if sent is None else clock, format, "commands")
     tensions, angles = ([] if commands == measured else other for other in (tensions, angles))
     tensions = tensions if len(tensions) == len(commands) else []
     units = {
@@ -232,18 +235,21 @@ def _shown(names: list[str]) -> str:
     return ", ".join(names[:MOST_SHOWN]) + (", ..." if len(names) > MOST_SHOWN else "")
 
 
-def _check_columns(
-    path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]
-) -> None:
-    for what, names in (("positions (columns in x, y and z)", positions), ("commands", commands)):
-        if not names:
-            raise InputError(
-                f"found no {what} among the columns {_shown(columns)}",
-                where=str(path),
-                remedy="give the CSV of the commands with --commands"
-                if format == motive_csv.FORMAT and positions
-                else "leave the recording out, and write [data.columns] as docs/reference/experiment.md says",
-            )
+def _not_found(table: CsvTable, time: str | None, format: str, what: str) -> InputError:
+    """The error of a file without positions or commands: its columns, and the first that is none for its text."""
+    columns = [str(name) for name in table.numeric(LOOKED_AT).columns]
+    words = f"found no {what} among the columns {_shown(columns)}" if columns else f"found no {what}"
+    for name in table.frame.columns.difference([*columns, time], sort=False)[:1]:
+        try:
+            table.numbers([name], allow_missing=True)
+        except InputError as error:
+            words += f"; text was left out, the first in {error.where.removeprefix(f'{table.path}, ')}: {error.what}"
+    remedy = "call x, y and z of each marker tip_x, tip_y, tip_z, and commands motor1, motor2, ..."
+    if format == motive_csv.FORMAT and what == "commands":
+        remedy = "give the CSV of the commands with --commands"
+    elif format in (rosbag.FORMAT, lerobot.FORMAT):
+        remedy = "write [data.columns] by hand, as docs/reference/experiment.md says"
+    return InputError(words, where=str(table.path), remedy=remedy)
 
 
 def _measured_angles(

@@ -269,10 +269,31 @@ def test_the_last_third_is_the_test_unless_recordings_are_named_for_it(tmp_path,
     assert "no recording is left to fit" in told
 
 
-def test_a_file_without_positions_is_refused(tmp_path):
-    table("t", "{marker}_{axis}", "u{0}").filter(regex="t$|u").to_csv(tmp_path / "run.csv", index=False)
-    with pytest.raises(InputError, match="found no positions"):
-        guess_columns(tmp_path / "run.csv")
+def test_a_file_without_positions_is_refused_with_the_names_that_are_recognised(tmp_path):
+    path, run = tmp_path / "run.csv", table("t", "{marker}_{axis}", "u{0}")
+    text = run.to_csv(index=False)
+    for table_text, message in (
+        (
+            run.filter(regex="t$|u|_[xy]$").to_csv(index=False),
+            r"no positions .* u4, low_x, low_y, tip_x, tip_y; call .* tip_z",
+        ),
+        (
+            run.filter(regex="t$|_").to_csv(index=False),
+            r"no commands among .* low_z, .*; call .* commands motor1, motor2",
+        ),
+        (text + text, r"no positions .*; text was left out, the first in row 40, column 't': 't'"),
+    ):
+        path.write_text(table_text)
+        with pytest.raises(InputError, match=message):
+            guess_columns(path)
+
+
+def test_a_file_of_commands_without_commands_is_told_by_its_own_columns(tmp_path):
+    run, sent = table("t", "{marker}_{axis}", "u{0}"), pd.DataFrame({"t": TIME, "note": "none"})
+    run.to_csv(tmp_path / "run.csv", index=False)
+    sent.to_csv(tmp_path / "sent.csv", index=False)
+    with pytest.raises(InputError, match=r"sent.csv: found no commands among the columns t; .* column 'note': 'none'"):
+        guess_columns(tmp_path / "run.csv", tmp_path / "sent.csv")
 
 
 def init(monkeypatch, capsys, *words: str) -> tuple[int, str]:
