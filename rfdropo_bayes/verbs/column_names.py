@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from string import punctuation
 from typing import NamedTuple
 
 import numpy as np
@@ -321,7 +322,9 @@ def _clock_of(table: CsvTable) -> str | None:
     or a unit of time in its name that rises: times that something took rise and fall."""
     names = [str(name) for name in table.frame.columns]
     called = {name: _parted(name) for name in names if TIME.search(_parted(name))}
-    first = (name for name, words in called.items() if TIME.match(words.lstrip("%#/_ ")) and _holds_times(table, name))
+    first = (
+        name for name, words in called.items() if TIME.match(words.lstrip(punctuation)) and _holds_times(table, name)
+    )
     rising = (name for name in names if (name in called or time_units_in_names(table, name)) and _rises(table, name))
     return next(first, None) or next(rising, None)
 
