@@ -253,13 +253,16 @@ def init(
     outline = _outline(_name(folder.resolve().name, "robot"), disks, unit, answers, ask.assumed)
     if guess is not None:
         guess, outline = with_drives(of_robot(guess, outline), outline)
-    robot, experiment = write_first_files(folder, outline, files, sent, guess, kept)
+    robot, experiment, unread = write_first_files(folder, outline, files, sent, guess, kept)
     typer.echo(f"wrote {robot}\nwrote {experiment}")
     if ask.assumed:
         typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
     told = [words for words in split.values() if words]
     for line in [*told, *assumed_of_columns(guess), *_found_lines(robot, experiment)] if guess else []:
         typer.echo(f"look over: {line}")
+    if unread:
+        typer.echo(f"not read: {unread}\nnext: repair it, and run init again in another folder, to find the frame")
+        return
     typer.echo(f"next: {shlex.join(['rfdropo', 'check', str(folder / 'experiment.toml')])}")
 
 

@@ -20,6 +20,8 @@ from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stam
 from rfdropo_bayes.errors import InputError
 
 HEAD = 100_000  # letters of a file that hold its first rows
+JSON = ("{", "[{", "[[")  # how JSON begins
+GIVE_CSV = "give a CSV file, plain or gzipped"
 MOTIVE = "Format Version"  # how the first line of an export of Motive's begins
 
 
@@ -37,7 +39,7 @@ def read_text(path: Path) -> str:
     """Text of a plain or gzipped file.
 
     Raises:
-        InputError: the file is missing, unreadable, a damaged gzip archive or not text.
+        InputError: the file is missing, unreadable, a damaged gzip archive, not text, or JSON.
     """
     if path.is_dir():
         raise InputError("is a folder, not a file", where=str(path), remedy=f'name its files, e.g. "{path.name}/*.csv"')
@@ -56,7 +58,9 @@ def read_text(path: Path) -> str:
         raise InputError("the gzip archive is cut short or damaged", where=str(path), remedy="fetch it again") from None
     text = _decoded(raw)
     if any(ord(sign) < 32 and sign not in "\t\n\r\f" for sign in text[:4096]):
-        raise InputError("is not a text file", where=str(path), remedy="give a CSV file, plain or gzipped")
+        raise InputError("is not a text file", where=str(path), remedy=GIVE_CSV)
+    if text.lstrip().startswith(JSON):
+        raise InputError("is JSON, not a table of columns", where=str(path), remedy=GIVE_CSV)
     return text
 
 

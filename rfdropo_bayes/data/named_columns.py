@@ -3,11 +3,13 @@
 Timing. The command in row k is in force from the time of row k until the time of row k + 1, as for a loop that measures
 and then commands; `first_command` finds the command before row 0. With `CsvColumns.commands_with_poses` it is in force
 from half-way after row k - 1 on, so that row k shows its pose. Commands may stand in their own table, with n or
-n - 1 rows for n observations; or with their own times and any number of rows.
+n - 1 rows for n observations; or with their own times and any number of rows. An empty cell of a command holds the
+command above it, as loggers write that note changes only.
 """
 
 from __future__ import annotations
 
+import copy
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -334,6 +336,7 @@ def read_tables(
 
     ``origin`` describes a CSV by default.
     """
+    source, held = _held(source, columns.commands)
     position, time = points(table, columns, mask_missing=mask_missing), _times(table, columns)
     markers = marker_names(columns)
     faults = find_faults(time, position, where=str(table.path), names=markers)
@@ -342,7 +345,7 @@ def read_tables(
     angle = _angles(table, columns)
     commands = SentCommands(sent, command, *_channels(columns), command[0], _largest(columns))
     commands = commands.of_poses() if columns.commands_with_poses else commands
-    notes = [*faults.notes, *_timing_notes(table, columns, time)]
+    notes = [*faults.notes, *_timing_notes(table, columns, time), *held]
     if columns.command_time is not None:
         notes += command_notes(commands.command_time, commands.command)
     seen = np.where(faults.mask[:, :, None], position, np.nan).reshape(len(time), -1)
@@ -493,6 +496,36 @@ def _counter_notes(table: CsvTable, source: CsvTable, columns: CsvColumns, motio
             ]
             notes += counter_notes(own, seen, unit)
     return notes
+
+
+def _held(source: CsvTable, names: Sequence[str]) -> tuple[CsvTable, list[str]]:
+    """The table with the command above in empty cells of commands, and a note if there are any.
+
+    Raises:
+        InputError: a column of commands begins with an empty cell.
+    """
+    source.require(names)
+    cells = source.frame[list(names)]
+    empty = cells.isna().to_numpy()
+    if not empty.any():
+        return source, []
+    if empty[0].any():
+        column = int(np.argmax(empty[0]))
+        first = int(np.argmin(empty[:, column]))
+        raise InputError(
+            f"the first command is in row {first}" if first else "holds no command",
+            where=f"{source.path}, row 0, column {names[column]!r}",
+            remedy="write the command that was in force into row 0"
+            + (f", or leave out the rows above row {first}" if first else ""),
+        )
+    held = copy.copy(source)
+    held.frame = source.frame.copy()
+    held.frame[list(names)] = cells.ffill()
+    row, column = np.argwhere(empty)[0]
+    return held, [
+        f"{int(empty.sum())} of {empty.size} cells of commands are empty, the first in row {row} of {names[column]}: "
+        "each holds the command above it, as if only changes were logged; if commands were lost, leave these rows out"
+    ]
 
 
 def _commands(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Float[np.ndarray, "rows cable"]:

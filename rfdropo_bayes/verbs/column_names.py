@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from string import punctuation
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,8 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.verbs.column_units import (
     ANGLES,
     FORCE,
+    FOREIGN,
+    PRESSURE,
     UNITS,
     WORD,
     Unit,
@@ -33,16 +36,20 @@ from rfdropo_bayes.verbs.column_units import (
 )
 
 TIME = re.compile(
-    r"^\W*(t|ts|time|timestamp|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock)(?![a-z])", re.IGNORECASE
-)
-AXIS = re.compile(r"(?<![a-z])[xyz](?![a-z])", re.IGNORECASE)
-MEASURED = re.compile(
-    r"meas|actual|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
-)
-SENT = re.compile(r"cmd|command|action|setpoint", re.IGNORECASE)  # if any columns match, only they are commands
-COMMAND = re.compile(
-    r"cmd|command|motor|servo|pull|cable|tendon|action|target|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
+    r"(?<![a-z])(t(?![ _\[]?\d)|ts|times?|timestamps?|stamp|date|datetime|secs?|seconds|millis|micros|nanos|clock|"
+    r"zeit|tiempo|tempo|时间|時間)(?![a-z])",
     re.IGNORECASE,
+)
+"""Names of times. Columns t1, t2, ... are anything but times."""
+AXIS = re.compile(r"(?:(?<![a-z])|(?<=[^a-z]p)|(?<=^p))[xyz](?![a-z])", re.IGNORECASE)  # as in x1, tip_x and tip_px
+MEASURED = re.compile(
+    r"meas(ured)?|actual|present|encoder|enc(?![a-z])|feedback|(?<![a-z])fb|joint_?states?|observation", re.IGNORECASE
+)
+AIMED = re.compile(r"goal|target|desired|(?<![a-z])(ref|reference|set)(?![a-z])", re.IGNORECASE)
+"""What a controller aims at: a command of its drives, or in x, y and z a place that the robot should reach."""
+SENT = re.compile(rf"cmd|command|action|setpoint|{AIMED.pattern}", re.IGNORECASE)
+COMMAND = re.compile(
+    rf"{SENT.pattern}|motor|servo|pull|cable|tendon|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)", re.IGNORECASE
 )
 NO_COMMAND = re.compile(
     r"(?<![a-z])(ids?|idx|index|frames?|seq|rows?|numbers?|nr|trial|episode|run|phase|pattern|label|flags?|status|mode|"
@@ -71,6 +78,8 @@ STRUCTURE = re.compile(
 """Words that formats put around the name of a marker."""
 LOOKED_AT = 2000  # rows that sizes are taken from
 MOST_SHOWN = 12  # columns that an error names; and rows from which a pattern of values is told
+EVEN = "no column is called a time, and this one alone rises evenly from row to row"
+MOSTLY, UNEVEN = 0.9, 0.5  # share of the steps of a clock that go on, and by how much of the usual step they may differ
 UNIT_LENGTH = 1e-3  # by how much the length of a quaternion may differ from one
 
 
@@ -131,24 +140,32 @@ def guess_columns(
         names: column names of a CSV without names; command_names: the same for the commands' file.
 
     Raises:
-        InputError: a file that cannot be read, or in which no positions or commands are found.
+        InputError: a file that cannot be read, that has names and is given others, or in which no positions or
+            commands are found.
     """
     format = recognised_format(path)
     own = format == named_columns.FORMAT or format in named_arrays.FORMATS
     whole, unit = _measured(format, path, names)
+    _check_names(whole, names, "--names")
     table = whole.numeric(LOOKED_AT)
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
+    even = _even_clock(table) if time is None and own else None
+    time = time or even
     columns = [str(name) for name in table.columns if name != time]
     triples, tensions, angles, free = _parts(columns, format)
     positions = list(triples.values())
     source, sending, clock = table, whole, None
     if sent is not None:
         sending = CsvTable(sent, (), names=command_names, machine_written=False)
+        _check_names(sending, command_names, "--command-names")
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name != clock]
     measured = [] if sent is not None else angles or tensions
     commands = _commands(source, free, measured, any_name=own or sent is not None)
-    _check_columns(path, format, columns, positions, commands)
+    if not positions:
+        raise _not_found(whole, time, format, "positions (columns in x, y and z)")
+    if not commands:
+        raise _not_found(sending, time if sent is None else clock, format, "commands")
     tensions, angles = ([] if commands == measured else other for other in (tensions, angles))
     tensions = tensions if len(tensions) == len(commands) else []
     units = {
@@ -161,7 +178,7 @@ def guess_columns(
     }
     units["command_time_unit"] = command_time_unit(sending, clock, _seconds(whole, time, units["time_unit"].unit))
     angles, units["motor_angle_unit"] = _measured_angles(
-        whole, table, angles if len(angles) == len(commands) else [], units["command_unit"].unit
+        whole, table, angles if len(angles) == len(commands) else [], commands, units["command_unit"].unit
     )
     used = {*commands, *names_of(positions), *tensions, *angles}
     return Guess(
@@ -177,9 +194,10 @@ def guess_columns(
         units={**units["command_unit"].others, **units["position_unit"].others},
         names=None if names is None else list(names),
         command_names=None if command_names is None else list(command_names),
-        evidence={key: unit.evidence for key, unit in units.items() if unit.evidence},
+        evidence=({"time": EVEN} if even else {})
+        | {key: unit.evidence for key, unit in units.items() if unit.evidence},
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
-        sent=source[commands].to_numpy(dtype=float),
+        sent=source[commands].ffill().to_numpy(dtype=float),
         seen=table[names_of(positions)].to_numpy(dtype=float).reshape(len(table), -1, 3),
         time_unit=units["time_unit"].unit,
         command_unit=units["command_unit"].unit,
@@ -192,34 +210,63 @@ def guess_columns(
 def _parts(columns: list[str], format: str) -> tuple[dict[str, list[str]], list[str], list[str], list[str]]:
     """Columns in x, y and z of each marker, of forces, of measured angles, and possible commands."""
     places = _array_triples(columns) if format in named_arrays.FORMATS else _triples(columns)
-    rest = [name for name in columns if SENT.search(name) or not any(name in triple for triple in places.values())]
+    placed = names_of(list(places.values()))
+    rest = [
+        name
+        for name in columns
+        if (SENT.search(name) or name not in placed) and not (AIMED.search(name) and AXIS.search(_parted(name)))
+    ]
     tensions = [name for name in rest if FORCE.search(name)]
-    angles = [name for name in rest if MEASURED.search(name) and name not in tensions]
-    return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *angles)]
+    read = [name for name in rest if MEASURED.search(name) and not SENT.search(name) and name not in tensions]
+    angles = [name for name in read if not (BESIDE.search(name) or RATE.search(name))]
+    return _markers(places), tensions, angles, [name for name in rest if name not in (*tensions, *read)]
 
 
-def _check_columns(
-    path: Path, format: str, columns: list[str], positions: list[list[str]], commands: list[str]
-) -> None:
-    for what, names in (("positions (columns in x, y and z)", positions), ("commands", commands)):
-        if not names:
-            shown = ", ".join(columns[:MOST_SHOWN]) + (", ..." if len(columns) > MOST_SHOWN else "")
-            raise InputError(
-                f"found no {what} among the columns {shown}",
-                where=str(path),
-                remedy="give the CSV of the commands with --commands"
-                if format == motive_csv.FORMAT and positions
-                else "leave the recording out, and write [data.columns] as docs/reference/experiment.md says",
-            )
+def _check_names(table: CsvTable, given: Sequence[str] | None, option: str) -> None:
+    own = [str(name) for name in table.frame.columns]
+    if given is not None and own != list(given):
+        raise InputError(
+            f"has names of its columns: {_shown(own)}",
+            where=str(table.path),
+            remedy=f"leave {option} out, or write the new names into the file",
+        )
 
 
-def _measured_angles(whole: CsvTable, table: pd.DataFrame, angles: list[str], sent: str) -> tuple[list[str], Unit]:
-    """Columns of measured angles that are of use beside commands in the unit ``sent``, and their unit."""
-    if not angles:
-        return [], Unit("rad")
-    unit = unit_in_names(whole, angles, ANGLES) or angle_unit(table, angles)
-    if unit.others or (unit.unit == named_columns.COUNTS and sent not in ANGLES):
-        return [], Unit("rad")  # nothing would use them, and their size is not known
+def _shown(names: list[str]) -> str:
+    return ", ".join(names[:MOST_SHOWN]) + (", ..." if len(names) > MOST_SHOWN else "")
+
+
+def _not_found(table: CsvTable, time: str | None, format: str, what: str) -> InputError:
+    """The error of a file without positions or commands: its columns, and the first that is none for its text."""
+    columns = [str(name) for name in table.numeric(LOOKED_AT).columns]
+    words = f"found no {what} among the columns {_shown(columns)}" if columns else f"found no {what}"
+    for name in table.frame.columns.difference([*columns, time], sort=False)[:1]:
+        try:
+            table.numbers([name], allow_missing=True)
+        except InputError as error:
+            words += f"; text was left out, the first in {error.where.removeprefix(f'{table.path}, ')}: {error.what}"
+    remedy = "call x, y and z of each marker tip_x, tip_y, tip_z, and commands motor1, motor2, ..."
+    if format == motive_csv.FORMAT and what == "commands":
+        remedy = "give the CSV of the commands with --commands"
+    elif format in (rosbag.FORMAT, lerobot.FORMAT):
+        remedy = "write [data.columns] by hand, as docs/reference/experiment.md says"
+    return InputError(words, where=str(table.path), remedy=remedy)
+
+
+def _measured_angles(
+    whole: CsvTable, table: pd.DataFrame, angles: list[str], commands: list[str], sent: str
+) -> tuple[list[str], Unit]:
+    """Columns of measured angles that are of use beside ``commands`` in the unit ``sent``, and their unit.
+
+    Without a unit of their own, readings that are called as the commands are in the unit of the commands.
+    """
+    unit = unit_in_names(whole, angles, ANGLES)
+    if unit is None and angles:
+        same = [_stem(name) for name in angles] == [_stem(name) for name in commands]
+        unit = Unit(sent, evidence=f"{angles[0]} is called as {commands[0]}") if same else angle_unit(table, angles)
+    useful = () if unit is None or unit.others else ANGLES if sent in ANGLES else ("deg", "rad")
+    if unit is None or unit.unit not in useful:
+        return [], Unit("rad")  # nothing would use them, or their size is not known
     return angles, unit
 
 
@@ -271,10 +318,28 @@ def _measured(format: str, path: Path, names: Sequence[str] | None) -> tuple[Csv
 
 
 def _clock_of(table: CsvTable) -> str | None:
-    """The first column that is called a time and holds times; else the first in a unit of time that always rises."""
+    """The first column whose name begins with a word for a time and that holds times; else the first with such a word
+    or a unit of time in its name that rises: times that something took rise and fall."""
     names = [str(name) for name in table.frame.columns]
-    called = next((name for name in names if TIME.search(name) and _holds_times(table, name)), None)
-    return called or next((name for name in names if time_units_in_names(table, name) and _rises(table, name)), None)
+    called = {name: _parted(name) for name in names if TIME.search(_parted(name))}
+    first = (
+        name for name, words in called.items() if TIME.match(words.lstrip(punctuation)) and _holds_times(table, name)
+    )
+    rising = (name for name in names if (name in called or time_units_in_names(table, name)) and _rises(table, name))
+    return next(first, None) or next(rising, None)
+
+
+def _even_clock(table: pd.DataFrame) -> str | None:
+    """The only column that rises evenly, if its name does not say that it is anything else."""
+    found = [str(name) for name in table.columns if not _told(str(name)) and _rises_evenly(table[name])]
+    return found[0] if len(found) == 1 else None
+
+
+def _told(name: str) -> bool:
+    """Whether a name or the unit in it says that a column is something else than a time."""
+    words = _parted(name)
+    parts = (COMMAND, MEASURED, FORCE, BESIDE, NO_COMMAND, PRESSURE, AXIS, *FOREIGN.values())
+    return any(part.search(words) for part in parts) or not UNITS.keys().isdisjoint(WORD.findall(words.lower()))
 
 
 def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
@@ -292,15 +357,21 @@ def _markers(triples: dict[str, list[str]]) -> dict[str, list[str]]:
 def _commands(table: pd.DataFrame, names: list[str], measured: list[str], *, any_name: bool) -> list[str]:
     """Columns of commands. If no name matches: all columns in files of a user's own format, or the ``measured`` angles
     or forces of drives whose commands nobody recorded.
+
+    Of aims and other columns that are called commands, one kind is meant: the larger, the others if there are as many.
+    Other columns that are called as the aims are read back.
     """
-    sent = [name for name in names if SENT.search(name)]
-    names = sent or [name for name in names if not NO_COMMAND.search(name) and not _counts_rows(table[name])]
+    sent = [name for name in names if SENT.search(AIMED.sub("", name))]
+    names = sent or [name for name in names if not (NO_COMMAND.search(name) or _numbers_rows(table[name], name))]
     turns = {name for four in _quaternions(table, names) for name in four}
     names = [name for name in names if name not in turns]
     called = [name for name in names if COMMAND.search(name)]
+    driven = [name for name in called if not BESIDE.search(name) and not RATE.search(name)]
+    aims = [name for name in driven if AIMED.search(name)]
+    others = [name for name in driven if name not in aims and _stem(name) not in map(_stem, aims)]
     return (
-        [name for name in names if SENT.search(name) and not RATE.search(name)]
-        or [name for name in called if not BESIDE.search(name) and not RATE.search(name)]
+        [name for name in names if sent and not RATE.search(name)]
+        or max(others, aims, key=len)
         or called
         or ([name for name in names if not BESIDE.search(name)] if any_name else [])
         or measured
@@ -308,9 +379,22 @@ def _commands(table: pd.DataFrame, names: list[str], measured: list[str], *, any
     )
 
 
-def _counts_rows(values: pd.Series) -> bool:
-    """Whether a column goes up by one from every row to the next."""
-    return len(values) > MOST_SHOWN and bool((values.diff().iloc[1:] == 1.0).all())
+def _stem(name: str) -> str:
+    """A name without the words that tell what was sent from what was measured: of the same motor, it is the same."""
+    return "".join(WORD.findall(SENT.sub("", MEASURED.sub("", name)).lower()))
+
+
+def _numbers_rows(values: pd.Series, name: str) -> bool:
+    """Whether a column goes up by one from every row to the next, or evenly, as times do, if its name allows times."""
+    by_one = len(values) > MOST_SHOWN and bool((values.diff().iloc[1:] == 1.0).all())
+    return by_one or (_rises_evenly(values) and not _told(name))
+
+
+def _rises_evenly(values: pd.Series) -> bool:
+    """Whether a column goes up from every row to the next, mostly by the usual step, and not by one as numbers do."""
+    steps = values.diff().iloc[1:]
+    usual = (steps / steps.median() - 1.0).abs() < UNEVEN
+    return len(values) > MOST_SHOWN and bool((steps > 0.0).all() and usual.mean() > MOSTLY and (steps != 1.0).any())
 
 
 def _quaternions(table: pd.DataFrame, names: list[str]) -> list[list[str]]:
@@ -325,6 +409,11 @@ def _quaternions(table: pd.DataFrame, names: list[str]) -> list[list[str]]:
     return quaternions
 
 
+def _parted(name: str) -> str:
+    """A name whose words begin with capitals, such as tipX, with a low line between them."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name)
+
+
 def names_of(positions: list[list[str]]) -> list[str]:
     """The columns of all markers."""
     return [name for triple in positions for name in triple]
@@ -334,8 +423,9 @@ def _triples(names: list[str]) -> dict[str, list[str]]:
     """Columns whose names differ in one letter, x, y or z: the common name, and the three columns in this order."""
     triples: dict[str, dict[str, str]] = {}
     for name in names:
-        for match in AXIS.finditer(name):
-            common = f"{name[: match.start()]}*{name[match.end() :]}".lower()
+        words = _parted(name)
+        for match in AXIS.finditer(words):
+            common = f"{words[: match.start()]}*{words[match.end() :]}".lower()
             triples.setdefault(common, {})[match[0].lower()] = name
     return {common: [axes[a] for a in "xyz"] for common, axes in triples.items() if set(axes) == set("xyz")}
 
@@ -366,11 +456,22 @@ def _marker_names(commons: list[str], structure: re.Pattern[str] | None) -> list
 
 
 def _holds_times(table: CsvTable, name: str) -> bool:
+    ticks = _ticks(table, name)
+    return len(ticks) == 1 or bool(len(ticks) > 1 and ticks[-1] != ticks[0])  # a date without a time of day is no clock
+
+
+def _rises(table: CsvTable, name: str) -> bool:
+    """Whether a column holds times that never fall and mostly grow from row to row."""
+    steps = np.diff(_ticks(table, name))
+    return len(steps) > 0 and bool((steps >= 0).all() and np.mean(steps > 0) > MOSTLY)
+
+
+def _ticks(table: CsvTable, name: str) -> np.ndarray:
+    """Times of the rows, as they are written; empty if a cell holds none."""
     try:
-        ticks = table.stamps(name, "s").ticks
+        return table.stamps(name, "s").ticks
     except InputError:
-        return False
-    return bool(len(ticks) == 1 or ticks[-1] != ticks[0])  # a date without a time of day is no clock
+        return np.zeros(0)
 
 
 def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
@@ -379,9 +480,3 @@ def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
         return 0.0
     stamps = table.stamps(time, unit)
     return float(stamps.ticks[-1] - stamps.ticks[0]) / stamps.per_second
-
-
-def _rises(table: CsvTable, name: str) -> bool:
-    """Whether a column grows from every row to the next."""
-    numbers = table.numeric(LOOKED_AT)
-    return len(numbers) > 1 and name in numbers and bool((numbers[name].diff().iloc[1:] > 0.0).all())

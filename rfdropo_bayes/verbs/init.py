@@ -95,10 +95,11 @@ def matching_commands(patterns: list[str], recordings: list[Path]) -> list[Path]
 def with_given(guess: Guess, **given: Any) -> Guess:
     """A guess with given values in place of guessed values: units, and the time from row to row [s]."""
     given = {key: value for key, value in given.items() if value is not None}
-    evidence = {key: words for key, words in guess.evidence.items() if key not in given}
+    settled = {*given, *(("time", "time_unit") if "sample_time" in given else ())}
+    evidence = {key: words for key, words in guess.evidence.items() if key not in settled}
     of_others = {"command_unit": guess.commands, "position_unit": names_of(guess.positions)}
-    settled = [name for key, names in of_others.items() if key in given for name in names]
-    units = {name: unit for name, unit in guess.units.items() if name not in settled}
+    same = [name for key, names in of_others.items() if key in given for name in names]
+    units = {name: unit for name, unit in guess.units.items() if name not in same}
     return guess._replace(**given, evidence=evidence, units=units)
 
 
@@ -179,8 +180,10 @@ def write_first_files(
     commands: list[Path],
     guess: Guess | None,
     kept: int = 0,
-) -> tuple[Path, Path]:
+) -> tuple[Path, Path, str]:
     """Write ``NAME.toml``, the robot, and ``experiment.toml``, and read both back.
+
+    Returns both, and why no recording can be read, in words: frame, size and order of cables are then not found.
 
     Args:
         folder: folder to create and write to.
@@ -218,13 +221,13 @@ def write_first_files(
     days, zero = days_of(recordings), None  # type: tuple[Any, DriveZero | None]
     if guess is None:
         write(_random_commands(outline))
-        return robot, experiment
+        return robot, experiment, ""
     known: dict[str, Any] = {"gravity": outline.gravity, "cables": outline.cable_names(), "kept": kept}
     tables = partial(data_tables, folder, outline.markers, recordings, commands, guess=guess, **known)
     plain = write(tables())
-    runs = _recordings(plain, folder)
+    runs, unread = _recordings(plain, folder)
     if not runs:
-        return robot, experiment
+        return robot, experiment, unread
     first = runs[0]
     if first.command_unit in ("m", "rad"):
         zero = zero_of_drives(runs, wraps=bool(guess.reads_drives and guess.unwrap))
@@ -245,10 +248,10 @@ def write_first_files(
     poses = None if guess.command_time is not None else poses
     tables = partial(tables, pieces=pieces, poses=poses)
     placed = write(tables(frame=frame), slow, first)
-    runs = _recordings(placed, folder)
+    runs, unread = _recordings(placed, folder)
     columns = None if placed.data is None else placed.data.columns
     if not runs or columns is None or not usual:
-        return robot, experiment
+        return robot, experiment, unread
     seen = runs[0]
     bends = outline.sets_bend is not None
     scaled, stiff = ("length" in outline.assumed), ("young_modulus" in outline.assumed)
@@ -291,7 +294,7 @@ def write_first_files(
             registration = registration._replace(frame=registration.frame._replace(shift=np.zeros(3)))
     gain = float(np.clip(registration.bend / registration.softness, *FORCES))
     write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame, gain)
-    return robot, experiment
+    return robot, experiment, unread
 
 
 def _of_poses(first: Trajectory, timed: bool) -> str | None:
@@ -305,14 +308,14 @@ def _of_poses(first: Trajectory, timed: bool) -> str | None:
     return f"a quadratic map of the commands of a pose's own row leaves {errors}"
 
 
-def _recordings(experiment: Experiment, folder: Path) -> list[Trajectory]:
-    """The recordings of fit and test; empty if one cannot be read: check reports the fault next."""
+def _recordings(experiment: Experiment, folder: Path) -> tuple[list[Trajectory], str]:
+    """The recordings of fit and test; if one cannot be read, none, and the reason."""
     if experiment.data is None:
-        return []
+        return [], ""
     try:
-        return [run for role in ROLES for run in load_recordings(experiment.data, folder, role)]
-    except InputError:
-        return []
+        return [run for role in ROLES for run in load_recordings(experiment.data, folder, role)], ""
+    except InputError as error:
+        return [], str(error)
 
 
 def _frame(experiment: Experiment, robot: Robot, guess: Guess) -> list[str]:
@@ -364,7 +367,7 @@ def _entries(
 
 def assumed_of_columns(guess: Guess) -> list[str]:
     """Assumptions and omissions of `data_tables` that no recording can settle; a sentence each."""
-    said = [f'{key} = "{getattr(guess, key)}": {words}' for key, words in guess.evidence.items()]
+    said = [f"{key} = {quoted(getattr(guess, key))}: {words}" for key, words in guess.evidence.items()]
     if guess.time is None and guess.sample_time is None:
         said.append(f'time = "{ROWS}": {NO_TIMES}')
     if guess.command_time is not None:
@@ -407,7 +410,7 @@ def data_tables(
     optional = [f"tensions = {quoted(guess.tensions)}"] if guess.tensions else []
     optional = [f"cables = {quoted(list(cables))}"] * bool(optional and cables) + optional
     if guess.motor_angles:
-        optional += [f"motor_angles = {quoted(guess.motor_angles)}", _unit_line(guess, "motor_angle_unit")]
+        optional += [f"motor_angles = {quoted(guess.motor_angles)}", _guessed_line(guess, "motor_angle_unit")]
     counts = [] if guess.counts_per_turn is None else [f"counts_per_turn = {guess.counts_per_turn:.9g}  # of the spool"]
     wraps = ", ".join(f"{quoted_key(name)} = {turn:.10g}" for name, turn in guess.unwrap.items())
     if wraps:
@@ -428,7 +431,7 @@ def data_tables(
         *_clock(guess),
         f"commands = {quoted(guess.commands)}  # one for each of the robot's channels, in their order"
         + (f"; ASSUMED: {order}" if order else ""),
-        _unit_line(guess, "command_unit"),
+        _guessed_line(guess, "command_unit"),
         *counts,
         *_other_units(guess),
         *_command_clock(guess),
@@ -436,7 +439,7 @@ def data_tables(
         "positions = [",
         *(f"    {quoted(triple)}," for triple in guess.positions),
         "]",
-        _unit_line(guess, "position_unit"),
+        _guessed_line(guess, "position_unit"),
         f"markers = {quoted(list(markers))}  # the robot's names, in the order of positions",
         "# x, y, z of the robot's base in terms of the file's axes: z runs away from the clamp.",
         *(frame or [f"axes = {quoted(axes)}{assumed}"]),
@@ -446,10 +449,10 @@ def data_tables(
     ]
 
 
-def _unit_line(guess: Guess, key: str) -> str:
-    """The line of a unit, with the evidence of one that was guessed."""
+def _guessed_line(guess: Guess, key: str) -> str:
+    """The line of a unit or column, with the evidence of one that was guessed."""
     evidence = guess.evidence.get(key)
-    return f'{key} = "{getattr(guess, key)}"' + (f"  # ASSUMED: {evidence}" if evidence else "")
+    return f"{key} = {quoted(getattr(guess, key))}" + (f"  # ASSUMED: {evidence}" if evidence else "")
 
 
 def _other_units(guess: Guess) -> list[str]:
@@ -467,7 +470,7 @@ def _clock(guess: Guess) -> list[str]:
         return [f'time = "{ROWS}"  # ASSUMED: {NO_TIMES}']
     if guess.format == rosbag.FORMAT:
         return ['time = "header"  # stamps if messages have them; "log": the times at which they were received']
-    return [f"time = {quoted(guess.time)}", _unit_line(guess, "time_unit")]
+    return [_guessed_line(guess, "time"), _guessed_line(guess, "time_unit")]
 
 
 def _command_clock(guess: Guess) -> list[str]:
@@ -476,7 +479,7 @@ def _command_clock(guess: Guess) -> list[str]:
         return []
     return [
         f"command_time = {quoted(guess.command_time)}",
-        _unit_line(guess, "command_time_unit"),
+        _guessed_line(guess, "command_time_unit"),
         "# ASSUMED: both clocks begin together. Else: reading of the observations' clock [s] when the "
         "commands' clock shows zero.",
         "command_offset = 0.0",

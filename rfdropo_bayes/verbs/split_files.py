@@ -1,4 +1,4 @@
-"""Files that hold several recordings: a clock that begins anew, or a column that names the session of each row."""
+"""Files that hold several recordings: a clock that begins anew, or a column that names a row's session or trial."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from rfdropo_bayes.files import output_folder
 from rfdropo_bayes.verbs.column_names import Guess, names_of
 
 SESSION = re.compile(r"(?<![a-z])(sessions?|days?|dates?|arms?|robots?|specimens?)(?![a-z])", re.IGNORECASE)
+TRIAL = re.compile(r"(?<![a-z])(trials?|episodes?|runs?|experiments?)(?![a-z])", re.IGNORECASE)
 MOST = 40  # recordings in a file: more changes are no recordings
 FEWEST = 10  # rows of a recording
 
@@ -29,8 +30,8 @@ def split_files(folder: Path, recordings: Sequence[Path], guess: Guess) -> dict[
     for path in recordings:
         table = CsvTable(path, (), names=guess.names, machine_written=False)
         used = [guess.time, *guess.commands, *names_of(guess.positions), *guess.tensions, *guess.motor_angles]
-        session, clock = _sessions(table.frame, used), _clock(table, guess)
-        changes = [np.diff(session) != 0, _begins_anew(clock)]
+        session, trial = (_numbers(table.frame, used, names) for names in (SESSION, TRIAL))
+        changes = [np.diff(session) != 0, np.diff(trial) != 0, _begins_anew(_clock(table, guess))]
         starts = np.append(0, np.flatnonzero(np.any(changes, axis=0)) + 1)
         ends = np.append(starts[1:], len(table))
         if not 1 < len(starts) <= MOST or np.min(ends - starts) < FEWEST:
@@ -61,9 +62,9 @@ def _begins_anew(clock: np.ndarray) -> np.ndarray:
     return gaps < -ANEW * usual if usual > 0.0 else np.zeros(len(gaps), dtype=bool)
 
 
-def _sessions(frame: pd.DataFrame, used: Sequence[str | None]) -> np.ndarray:
-    """Number of the session of each row, by the columns that name sessions, in the order of the rows."""
-    beside = [name for name in frame.columns if name not in used and SESSION.search(str(name))]
+def _numbers(frame: pd.DataFrame, used: Sequence[str | None], names: re.Pattern[str]) -> np.ndarray:
+    """Number of the session or trial of each row, by the columns with such ``names``, in the order of the rows."""
+    beside = [name for name in frame.columns if name not in used and names.search(str(name))]
     named = [name for name in beside if frame[name].nunique() <= MOST]
     if not named:
         return np.zeros(len(frame), dtype=int)

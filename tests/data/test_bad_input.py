@@ -38,6 +38,10 @@ def test_empty_files(tmp_path):
     path.write_bytes(b"\xff\xfe\x00\x80")
     with fails("not a text file"):
         read_sofa_csv(path)
+    for text in ('{"t": [0, 1]}', '[{"t": 0},\n {"t": 1}]\n', "\n[[0, 1], [1, 2]]"):
+        path.write_text(text)
+        with fails("is JSON, not a table of columns; give a CSV file"):
+            read_sofa_csv(path)
 
 
 def test_a_file_cut_anywhere_in_its_last_row_is_noticed(sofa_table, write, tmp_path):

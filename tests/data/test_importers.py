@@ -221,6 +221,25 @@ def test_plain_csv_takes_commands_from_a_file_of_their_own(plain, tmp_path):
         read_mapped("csv", plain, CsvColumns.model_validate(MAPPING), tmp_path / "commands.csv")
 
 
+def test_a_command_holds_in_the_empty_cells_below_it_and_they_are_counted(plain, tmp_path):
+    columns, sent = CsvColumns.model_validate(MAPPING), tmp_path / "sent.csv"
+    sent.write_text("motor;note\n7,0;x\n;x\n;x\n9,5;x\n" + ";x\n" * 35)
+    recording = read_mapped("csv", plain, columns, sent)
+    np.testing.assert_allclose(np.rad2deg(recording.command[:, 0]), [7.0] * 3 + [9.5] * 36)
+    assert "37 of 39 cells of commands are empty, the first in row 1 of motor" in recording.notes[0]
+    sent.write_text("motor;note\n" + ";x\n" * 2 + "9,5;x\n" + ";x\n" * 36)
+    with pytest.raises(
+        InputError, match="row 0, column 'motor': the first command is in row 2; write the command that"
+    ):
+        read_mapped("csv", plain, columns, sent)
+    sent.write_text("motor;note\n" + ";x\n" * 39)
+    with pytest.raises(InputError, match="row 0, column 'motor': holds no command"):
+        read_mapped("csv", plain, columns, sent)
+    sent.write_text("motor;note\n7,0;x\ninf;x\n" + ";x\n" * 37)
+    with pytest.raises(InputError, match="row 1, column 'motor': NaN or empty cell"):
+        read_mapped("csv", plain, columns, sent)
+
+
 def test_plain_csv_turns_the_object_with_the_frame(tmp_path):
     text = "x,y,z,u,ox,oy,oz,qx,qy,qz,qw\n"
     text += "".join(f"{100 + row},0,0,{row},0,0.5,0,0,0.7071068,0,0.7071068\n" for row in range(4))

@@ -239,8 +239,9 @@ def test_tables_with_types_of_their_own_for_missing_values(backend):
     np.testing.assert_array_equal(found.position_mask[:, 0], (np.arange(20) < 6) | (np.arange(20) > 9))
     assert found.missing == "1 missing tensions"
     assert found.sha256 == Trajectory.from_pandas(frame, columns).sha256
-    with pytest.raises(InputError, match="NaN or empty cell"):
-        Trajectory.from_pandas(frame.assign(u=frame["x"]).convert_dtypes(dtype_backend=backend), columns)
+    gaps = Trajectory.from_pandas(frame.assign(u=frame["x"]).convert_dtypes(dtype_backend=backend), columns)
+    assert any("4 of 20 cells of commands are empty, the first in row 6 of u" in note for note in gaps.notes)
+    np.testing.assert_array_equal(gaps.command[6:10], gaps.command[[5] * 4])
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from rfdropo_bayes.model.experiment import load_experiment, matching
 from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_names import guess_columns, suggested_names
-from rfdropo_bayes.verbs.init import data_tables, with_counts, with_turns
+from rfdropo_bayes.verbs.init import data_tables, with_counts, with_given, with_turns
 
 ROWS = 40
 TIME = 0.05 * np.arange(ROWS)
@@ -43,6 +43,8 @@ def table(time: str, position: str, command: str, scale: float = 1.0, factor: fl
         ("Zeit [s]", "{marker} {axis} [mm]", "Motor {0} [deg]", 1.0, ("s", "deg", "mm"), ["low", "tip"]),
         ("Time_s", "{marker}_{axis}_mm", "M{0}_cmd_counts", 1.0, ("s", "counts", "mm"), ["low", "tip"]),
         ("t", "{marker}_{axis}_mm", "axis {0} (ticks)", 1.0, ("s", "counts", "mm"), ["low", "tip"]),
+        ("t", "{marker}_p{axis}", "motor{0} [rad]", 1.0, ("s", "rad", "mm"), ["low_p", "tip_p"]),
+        ("t", "p{axis}_{marker}", "motor{0} [rad]", 1.0, ("s", "rad", "mm"), ["p_low", "p_tip"]),
     ],
 )
 def test_columns_are_recognised_by_their_names(tmp_path, time, position, command, scale, units, markers):
@@ -56,6 +58,20 @@ def test_columns_are_recognised_by_their_names(tmp_path, time, position, command
     assert guess.commands == [command.format(k) for k in range(1, 5)]
     assert [len(triple) for triple in guess.positions] == [3, 3]
     assert guess.markers == markers
+
+
+def test_capitals_begin_words(tmp_path):
+    run = table("t", "{marker}_{axis}", "motorCmd{0}")
+    run = run.rename(
+        columns={f"{marker}_{axis}": f"{marker}{axis.upper()}" for marker in ("low", "tip") for axis in "xyz"}
+    )
+    for name in ("gyroX", "gyroY", "gyroZ", "targetX", "targetY", "targetZ", "tipVX", "tipVY", "tipVZ"):
+        run[name] = np.sin(TIME)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert guess.positions == [["lowX", "lowY", "lowZ"], ["tipX", "tipY", "tipZ"]]
+    assert guess.markers == ["low", "tip"]
+    assert guess.commands == [f"motorCmd{k}" for k in range(1, 5)]
 
 
 def test_semicolons_decimal_commas_and_compression_are_seen_through(tmp_path):
@@ -77,6 +93,47 @@ def test_milliseconds_forces_and_measured_angles_are_told_apart(tmp_path):
     assert guess.tensions == [f"tension{k}" for k in range(1, 5)]
     assert guess.motor_angles == [f"motor{k}_meas" for k in range(1, 5)]
     assert guess.unused == ["battery"]
+
+
+@pytest.mark.parametrize(
+    ("sent", "read", "unit", "angles"),
+    [
+        ("goal_position_{0}", "present_position_{0}", "counts", 4),
+        ("theta_des_{0}", "theta_{0}_meas", "rad", 4),
+        ("l{0}_ref", "l{0}_meas", "mm", 0),
+        ("desired_{0}", "actual_{0}", "mm", 0),
+        ("p{0}_set_kPa", "p{0}_meas_kPa", "kPa", 0),
+        ("pull_{0}_target", "pull_{0}", "mm", 0),
+    ],
+)
+def test_what_was_sent_is_told_from_what_was_measured(tmp_path, sent, read, unit, angles):
+    """Readings are in the unit of the commands that they are called after, and of use if that is an angle."""
+    run = table("t", "{marker}_{axis}", sent)
+    size = 4000.0 if unit == "counts" else 10.0
+    for k in range(1, 5):
+        run[sent.format(k)] = (size * run[sent.format(k)]).round().astype(int)
+        run[read.format(k)] = run[sent.format(k)]
+        run[f"present_current_{k}"] = run[f"present_velocity_{k}"] = 0.1
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.commands, guess.command_unit) == ([sent.format(k) for k in range(1, 5)], unit)
+    assert guess.motor_angles == [read.format(k) for k in range(1, 5)][:angles]
+    assert not angles or guess.motor_angle_unit == unit
+    assert not guess.reads_drives
+
+
+@pytest.mark.parametrize("command", ["cmd_{0}", "u{0}", "north{0}"])
+@pytest.mark.parametrize("aim", ["target_{0}", "{0}_ref", "goal.{0}", "tip_desired_{0}"])
+@pytest.mark.parametrize("axes", ["xyz", "xy"])
+def test_a_place_that_a_controller_aims_at_is_neither_a_marker_nor_a_command(tmp_path, command, aim, axes):
+    run = table("t", "{marker}_{axis}", command)
+    for axis in axes:
+        run[aim.format(axis)] = np.sin(TIME)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert guess.markers == ["low", "tip"]
+    assert guess.commands == [command.format(k) for k in range(1, 5)]
+    assert guess.unused == [aim.format(axis) for axis in axes]
 
 
 def test_counters_that_begin_anew_are_read_on(tmp_path):
@@ -114,9 +171,55 @@ def test_a_column_of_times_in_another_language_is_known_by_its_unit_if_it_rises(
     assert guess_columns(tmp_path / "run.csv").time is None
 
 
+@pytest.mark.parametrize(
+    ("name", "others"),
+    [
+        ("elapsed_time", {}),
+        ("ros_time", {"solve_time": np.abs(np.sin(TIME))}),
+        ("rosTime", {"header.stamp.nanosec": (1e9 * TIME % 1e9).astype(int), "header.stamp.sec": TIME.astype(int)}),
+        ("__time", {"t1": 3.0}),
+        ("times", {"loop_dt": 0.05}),
+        ("Zeit", {"t1": 20.0 * TIME, "t2": 1.0, "t3": 2.0}),
+        ("时间", {}),
+        ("run.t", {"run.tip_t": 20.0 + np.sin(TIME)}),
+    ],
+)
+@pytest.mark.parametrize("first", [True, False])
+def test_times_are_called_so_anywhere_in_their_name(tmp_path, name, others, first):
+    run = table("t", "{marker}_{axis}", "motor{0}").rename(columns={"t": name})
+    for number, (other, value) in enumerate(others.items()):
+        run.insert(number if first else len(run.columns), other, value)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.time_unit) == (name, "s")
+    assert guess.unused == list(others)
+    assert "time" not in guess.evidence
+
+
+@pytest.mark.parametrize("command", ["motor{0}", "north{0}"])
+def test_a_column_that_rises_evenly_is_the_time_if_none_is_called_so_and_never_a_cable(tmp_path, command):
+    run = table("moment", "{marker}_{axis}", command)
+    run.loc[7:, "moment"] += 0.1  # two rows were lost
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert (guess.time, guess.commands) == ("moment", [command.format(k) for k in range(1, 5)])
+    assert "rises evenly" in guess.evidence["time"]
+    lines = data_tables(tmp_path, ["low", "tip"], [], [], guess)
+    assert f'time = "moment"  # ASSUMED: {guess.evidence["time"]}' in lines
+    assert "time" not in with_given(guess, sample_time=0.05).evidence
+    for other in ({"t": TIME}, {"other": 3.0 * TIME}):
+        run.assign(**other).to_csv(tmp_path / "run.csv", index=False)
+        guess = guess_columns(tmp_path / "run.csv")
+        assert guess.time == ("t" if "t" in other else None)
+        assert guess.commands == [command.format(k) for k in range(1, 5)]
+    for counter in (5 + np.arange(ROWS), TIME**2, np.repeat(TIME[::2], 2)):
+        run.assign(moment=counter).to_csv(tmp_path / "run.csv", index=False)
+        assert guess_columns(tmp_path / "run.csv").time is None
+
+
 def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, monkeypatch, capsys):
     for number in (1, 2):
-        run = table("nummer", "{marker}_{axis}", "motor{0}")
+        run = table("nummer", "{marker}_{axis}", "motor{0}").assign(nummer=np.arange(ROWS))
         run.loc[3 * number : 8, ["low_x", "low_y", "low_z"]] = np.nan
         run.to_csv(tmp_path / f"Prüfung {number}.csv", index=False)
     monkeypatch.chdir(tmp_path)
@@ -130,6 +233,18 @@ def test_lost_markers_and_letters_of_any_alphabet_are_written_down(tmp_path, mon
     experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
     (fitted,) = load_recordings(experiment.data, tmp_path / "arm")
     assert int((~fitted.position_mask).sum()) == 6
+
+
+def test_a_recording_that_cannot_be_read_is_said_with_what_it_leaves_unknown(tmp_path, monkeypatch, capsys):
+    run = table("time", "{marker}_{axis}", "motor{0}")
+    run.loc[:4, "motor2"] = np.nan
+    run.to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    status, told = init(monkeypatch, capsys, "arm", "--recording", "run.csv")
+    assert status == 0
+    assert "run.csv, row 0, column 'motor2': the first command is in row 5" in told
+    assert "next: repair it, and run init again" in told
+    assert "rfdropo check" not in told
 
 
 def test_the_last_third_is_the_test_unless_recordings_are_named_for_it(tmp_path, monkeypatch, capsys):
@@ -154,10 +269,31 @@ def test_the_last_third_is_the_test_unless_recordings_are_named_for_it(tmp_path,
     assert "no recording is left to fit" in told
 
 
-def test_a_file_without_positions_is_refused(tmp_path):
-    table("t", "{marker}_{axis}", "u{0}").filter(regex="t$|u").to_csv(tmp_path / "run.csv", index=False)
-    with pytest.raises(InputError, match="found no positions"):
-        guess_columns(tmp_path / "run.csv")
+def test_a_file_without_positions_is_refused_with_the_names_that_are_recognised(tmp_path):
+    path, run = tmp_path / "run.csv", table("t", "{marker}_{axis}", "u{0}")
+    text = run.to_csv(index=False)
+    for table_text, message in (
+        (
+            run.filter(regex="t$|u|_[xy]$").to_csv(index=False),
+            r"no positions .* u4, low_x, low_y, tip_x, tip_y; call .* tip_z",
+        ),
+        (
+            run.filter(regex="t$|_").to_csv(index=False),
+            r"no commands among .* low_z, .*; call .* commands motor1, motor2",
+        ),
+        (text + text, r"no positions .*; text was left out, the first in row 40, column 't': 't'"),
+    ):
+        path.write_text(table_text)
+        with pytest.raises(InputError, match=message):
+            guess_columns(path)
+
+
+def test_a_file_of_commands_without_commands_is_told_by_its_own_columns(tmp_path):
+    run, sent = table("t", "{marker}_{axis}", "u{0}"), pd.DataFrame({"t": TIME, "note": "none"})
+    run.to_csv(tmp_path / "run.csv", index=False)
+    sent.to_csv(tmp_path / "sent.csv", index=False)
+    with pytest.raises(InputError, match=r"sent.csv: found no commands among the columns t; .* column 'note': 'none'"):
+        guess_columns(tmp_path / "run.csv", tmp_path / "sent.csv")
 
 
 def init(monkeypatch, capsys, *words: str) -> tuple[int, str]:
@@ -361,6 +497,13 @@ def test_a_file_without_names_is_read_by_the_names_that_init_suggests(tmp_path, 
     assert status == 2
     suggested = "t,c1,c2,c3,c4,low_x,low_y,low_z,tip_x,tip_y,tip_z"
     assert f'if they are in this order, write {suggested} above it, or give --names "{suggested}"' in told
+    run.to_csv(tmp_path / "named.csv", index=False)
+    for option in ("--names", "--command-names"):
+        named = ("--recording", "named.csv", "--commands", "named.csv", option, suggested)
+        status, told = init(monkeypatch, capsys, "arm", *named)
+        assert status == 2
+        assert "named.csv: has names of its columns: t, u1, u2, u3, u4, low_x, low_y" in told
+        assert f"leave {option} out" in told
     assert init(monkeypatch, capsys, "arm", *words, "--names", suggested)[0] == 0
     experiment, _ = load_experiment(tmp_path / "arm" / "experiment.toml")
     (read,) = load_recordings(experiment.data, tmp_path / "arm")

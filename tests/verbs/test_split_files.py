@@ -33,6 +33,20 @@ def test_a_file_is_split_where_its_clock_begins_anew_and_its_session_changes(tmp
     assert told == [str(1 + order.index(part["session"].iloc[0])) for part in read if told]
 
 
+@pytest.mark.parametrize("name", ["trial_id", "Trial", "episode_index", "run", "experiment_nr"])
+def test_a_file_is_split_where_its_trial_changes_though_its_clock_goes_on(tmp_path, name):
+    whole = table(["wet", "dry"], 2).rename(columns={"session": name})
+    whole["t"] = np.arange(float(len(whole)))
+    whole.to_csv(tmp_path / "all.csv", index=False)
+    guess = guess_columns(tmp_path / "all.csv")
+    found = split_files(tmp_path / "arm", [tmp_path / "all.csv"], guess)
+    assert [path.name for path in found] == ["all_1.csv", "all_2.csv"]  # no session: trials are of one day
+    assert next(iter(found.values())) == "all.csv holds 2 recordings, split before rows 80"
+    whole[name] = np.arange(len(whole)) // 3  # too short for recordings
+    whole.to_csv(tmp_path / "all.csv", index=False)
+    assert list(split_files(tmp_path / "b", [tmp_path / "all.csv"], guess)) == [tmp_path / "all.csv"]
+
+
 def test_a_file_of_one_recording_stays(tmp_path):
     table(["wet"], 1).to_csv(tmp_path / "one.csv", index=False)
     path = tmp_path / "one.csv"
