@@ -18,7 +18,10 @@ ANGLES = ("deg", "rad", "counts")
 PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
 UNITS = ("mm", "cm", "m", "in", *ANGLES, *PASCALS, *FORCES)
-FOUND = ("test = ", "axes = ", "origin = ", "commands = ", "commands_with_poses = ", "unwrap = ", "[model.groups]")
+FOUND = (
+    *("test = ", "axes = ", "origin = ", "commands = ", "commands_with_poses = ", "unwrap = "),
+    *("[model.groups]", "# ASSUMED: drives"),
+)
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
@@ -267,7 +270,7 @@ def init(
 
 
 def _found_lines(robot: Path, experiment: Path) -> list[str]:
-    """Frame, order and azimuths that were found from a recording, each with its evidence."""
+    """Frame, order, zeros and azimuths that were found from a recording, each with its evidence."""
     lines = [line for line in experiment.read_text(encoding="utf-8").splitlines() if line.startswith(FOUND)]
     lines += [line for line in robot.read_text(encoding="utf-8").splitlines() if line.startswith("# ASSUMED azimuths")]
     return [line for line in lines if "ASSUMED" in line]

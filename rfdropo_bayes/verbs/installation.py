@@ -124,8 +124,10 @@ def installed_priors(
         pull = scales_of(robot).pull if recording is None else largest_pull(robot, recording, from_zero)
         if pull > 0.0 and zero is not None:
             wound = np.asarray(robot.channel_matrix(robot.nominal())) @ zero.command
+            lengths = "; lengths of cables are to be written as pulls" if robot.command_unit == "m" else ""
+            lines.append(f"# ASSUMED: drives have zeros of their own, {zero.words}{lengths}")
             for name, place in zip(robot.initial_displacement_names, wound, strict=True):
-                normal(name, ZERO * pull, f"ASSUMED: zero of the cable, from {zero.words}", -place)
+                normal(name, ZERO * pull, f"zero of the cable: {ZERO:g} of the largest pull", -place)
         elif pull > 0.0:
             normal("initial_displacement", ZERO * pull, f"zero of every cable: {ZERO:g} of the largest pull")
     turn, shift = (np.zeros(3), np.zeros(3)) if frame is None else (frame.remaining_turn, frame.shift)

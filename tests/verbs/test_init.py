@@ -522,6 +522,22 @@ def test_heights_belong_to_the_markers_that_they_name(tmp_path, monkeypatch, cap
     assert load_recordings(experiment.data, tmp_path / "arm")[0].marker_names == ("low", "tip")
 
 
+def test_servos_that_rest_at_half_a_turn_are_said_and_centred_there(tmp_path, monkeypatch, capsys):
+    run = table("t", "{marker}_{axis}", "goal_position_{0}")
+    names = [f"goal_position_{k}" for k in range(1, 5)]
+    run[names] = np.round(2048 + 400 * (run[names] - run[names].iloc[0])).astype(int)
+    run.to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    words = ("--recording", "run.csv", "--length-mm", "200", "--counts-per-turn", "4096", "--spool-radius-mm", "10")
+    status, told = init(monkeypatch, capsys, "arm", *words)
+    assert status == 0
+    assert "look over: # ASSUMED: drives have zeros of their own, the command at which recordings begin" in told
+    priors = load_experiment(tmp_path / "arm" / "experiment.toml")[0].model.priors
+    assert [priors[f"initial_displacement_cable_{k}"]["loc"] for k in (1, 2, 3, 4)] == pytest.approx(
+        [-0.01 * np.pi] * 4, rel=2e-3
+    )
+
+
 def test_positions_and_commands_may_be_two_files_without_names(tmp_path, monkeypatch, capsys):
     run = table("t", "{marker}_{axis}", "u{0}")
     sent = [name for name in run if name.startswith("u")]
