@@ -258,8 +258,8 @@ def init(
         guess, outline = with_drives(of_robot(guess, outline), outline)
     robot, experiment, unread = write_first_files(folder, outline, files, sent, guess, kept)
     typer.echo(f"wrote {robot}\nwrote {experiment}")
-    if ask.assumed:
-        typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(ask.assumed))}")
+    if outline.assumed:
+        typer.echo(f"assumed, and marked ASSUMED in the robot file: {', '.join(sorted(outline.assumed))}")
     told = [words for words in split.values() if words]
     for line in [*told, *assumed_of_columns(guess), *_found_lines(robot, experiment)] if guess else []:
         typer.echo(f"look over: {line}")

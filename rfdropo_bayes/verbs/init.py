@@ -32,7 +32,7 @@ from rfdropo_bayes.verbs.installation import DriveZero, installed_mechanisms, in
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
-from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, unit_of_motion
+from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, lengths_for_angles, unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
@@ -156,17 +156,29 @@ def _moved(guess: Guess, outline: RobotOutline) -> Guess:
 
 
 def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutline]:
-    """A guess and a robot whose commands are inputs of drives of unknown force, such as pressures, if no name says that
-    they are lengths, and lengths would bend the robot much farther than its markers moved, even in millimetres."""
+    """A guess and a robot with drives of another kind, if the motion shows that no unit of the guessed kind is right.
+
+    Angles that no body bends by, of spools of unknown size, are millimetres of cable if these explain the motion.
+    Lengths that no name says are inputs of drives of unknown force, such as pressures, if they would bend the robot
+    much farther than its markers moved, even in millimetres.
+    """
     evidence = guess.evidence.get("command_unit", "")
-    named = guess.units or any(NAMED.search(name) for name in guess.commands)
-    if not evidence or named or outline.pairs or outline.command_unit != "m" or "markers" in outline.assumed:
-        return guess, outline
     robot = parse_table(Robot, outlined_tables(outline), where="outline")
-    if len(guess.commands) != len(robot.channel_names) or len(guess.positions) != len(outline.markers):
+    fits = len(guess.commands) == len(robot.channel_names) and len(guess.positions) == len(outline.markers)
+    if not evidence or guess.units or not fits or "markers" in outline.assumed:
         return guess, outline
-    seen = METRES[guess.position_unit] * guess.seen
-    words = bends_too_far(robot, METRES["mm"] * guess.sent, seen, list(outline.markers.values()))
+    seen, heights = METRES[guess.position_unit] * guess.seen, list(outline.markers.values())
+    if guess.command_unit in ("rad", "deg") and "spool_radius" in outline.assumed:
+        lengths = replace(outline, command_unit="m", assumed=outline.assumed - {"spool_radius"})
+        pulled = parse_table(Robot, outlined_tables(lengths), where="outline")
+        words = lengths_for_angles(robot, pulled, guess.sent, seen, heights)
+        if words is not None:
+            said = {**guess.evidence, "command_unit": f"{evidence}, {words}"}
+            return guess._replace(command_unit="mm", evidence=said), lengths
+    named = any(NAMED.search(name) for name in guess.commands)
+    if named or outline.pairs or outline.command_unit != "m":
+        return guess, outline
+    words = bends_too_far(robot, METRES["mm"] * guess.sent, seen, heights)
     if words is None:
         return guess, outline
     said = {**guess.evidence, "command_unit": f"{evidence}; {words}: drives of unknown force, such as pressures"}

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data.named_columns import COMMAND_UNITS
+from rfdropo_bayes.data.named_columns import COMMAND_UNITS, METRES
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_units import ANGLES, METRIC, Unit
 from rfdropo_bayes.verbs.motion_size import EXPLAINED, IMPOSED, OFF, Size
@@ -101,6 +101,36 @@ def unit_of_motion(
     said = [_driven_words(moved.get(name), name) for name in dict.fromkeys((chosen, guessed.unit))]
     words = f"the markers move by {1e3 * measured:.3g} mm, by the cables {', '.join(said)}"
     return Unit(chosen, guessed.others, f"{guessed.evidence}; {words}")
+
+
+def lengths_for_angles(
+    turned: Robot,
+    pulled: Robot,
+    command: Float[np.ndarray, "row channel"],
+    position: Float[np.ndarray, "row marker 3"],
+    heights: Sequence[float],
+) -> str | None:
+    """Motion by millimetres of cable, in words, if it explains the measured motion and no unit of angles does; None
+    otherwise.
+
+    Args:
+        turned: robot whose commands are angles.
+        pulled: robot whose commands are lengths of cable.
+        command: values in the unknown unit.
+        position: positions of the markers [m], in any frame.
+        heights: heights of the same markers on the robot [m].
+    """
+    measured = spread(position)
+
+    def moved(robot: Robot, factor: float) -> Size | None:
+        driven = driven_motion(robot, factor * command, heights)
+        return None if driven is None else Size(measured, spread(driven))
+
+    angles = [moved(turned, COMMAND_UNITS[unit][1]) for unit in ("rad", "deg")]
+    if measured == 0.0 or any(size is not None and size.within(EXPLAINED) for size in angles):
+        return None
+    size = moved(pulled, METRES["mm"])
+    return None if size is None or not size.within(EXPLAINED) else _driven_words(size, "mm")
 
 
 def bends_too_far(

@@ -8,7 +8,7 @@ import pytest
 from rfdropo_bayes.data.named_columns import COMMAND_UNITS
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.verbs.column_units import Unit
-from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, driven_motion, spread, unit_of_motion
+from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, driven_motion, lengths_for_angles, spread, unit_of_motion
 
 ANSWERS = {"name": "cone", "length": 0.2, "radius": 0.015, "markers": {"middle": 0.1, "tip": 0.2}}
 HEIGHTS = {"middle": 0.1, "tip": 0.2}
@@ -62,6 +62,18 @@ def test_degrees_are_told_from_radians_and_other_units_are_left():
     assert unit_of_motion(arm, opposed(0.5 * 180 / np.pi), position, HEIGHTS, Unit("rad")).unit == "deg"
     for unit in ("N", "mm"):  # forces impose no motion, and lengths of cable are no commands of a motor
         assert unit_of_motion(arm, opposed(1.0), position, HEIGHTS, Unit(unit)) == Unit(unit)
+
+
+@pytest.mark.parametrize(("true", "lengths"), [("mm", True), ("rad", False), ("deg", False)])
+def test_angles_that_no_body_bends_by_are_lengths_if_these_explain_the_motion(true, lengths):
+    turned, pulled, heights = robot(unit="rad"), robot(), list(HEIGHTS.values())
+    own, size = (pulled, 1e-3) if lengths else (turned, COMMAND_UNITS[true][1])
+    command = opposed(0.005 / (size if lengths else 0.01 * size))
+    across = 1.2 * driven_motion(own, size * command, heights)
+    position = np.concatenate([across, np.full((*across.shape[:2], 1), 0.1)], axis=2)
+    found = lengths_for_angles(turned, pulled, command, position, heights)
+    assert (found is not None) == lengths
+    assert found is None or found.startswith("in mm ")
 
 
 def test_a_motion_that_no_unit_explains_keeps_the_guess():
