@@ -92,6 +92,16 @@ def laws() -> dict[str, Mapping[str, Any]]:
     return {key: counted(sum(line[f"{key}_right"] for line in lines), len(lines)) for key in ("port", "law")}
 
 
+def strangers() -> dict[str, Mapping[str, Any]]:
+    """Share of drawn arms whose hidden cause is named first, and of those that hide none whose audit is silent."""
+    lines = read_lines(REPORTS / "strangers" / "ledger.jsonl")
+    hidden, clean = ([line for line in lines if (line["hidden"] == "nothing") == silent] for silent in (False, True))
+    return {
+        "named": counted(sum(line["hidden"] in (line["classes"] or [[]])[0] for line in hidden), len(hidden)),
+        "silent": counted(sum(line["verdict"] == "no_discrepancy" for line in clean), len(clean)),
+    }
+
+
 def sizes() -> Mapping[str, Any]:
     """Share of 90 % intervals that hold the size, given the right cause."""
     learnt = [size for line in read_lines(REPORTS / "size_coverage" / "rod.jsonl") for size in line.get("sizes", [])]
@@ -148,6 +158,7 @@ def page() -> str:
         motion=audits("audit_power/unknown_scale/datasets.jsonl", "audit_power/visible_steps/datasets.jsonl"),
         today=audits("audit_power/visible_steps/datasets.jsonl", seeds=(5008, 5009)),
         laws=laws(),
+        strangers=strangers(),
         sizes=sizes(),
         inferred=table1("rod"),
         trunk=json.loads((REPORTS / "sim2real_trunk" / "summary.json").read_text(encoding="utf-8")),
