@@ -64,6 +64,10 @@ MILLIMETRES_ABOVE, DEGREES_ABOVE = 5.0, 20.0
 """Largest motion of a soft arm in metres, and largest turn of its drives in radians."""
 COUNTS_ABOVE = 1e3  # largest of whole numbers that no cable moves in mm, nor a motor in deg
 METRIC = ("m", "cm", "mm")  # units that are told by a size: inches and centimetres are within a factor of three
+SERVO_PULSE = 400.0  # [us], the shortest pulse of a hobby servo; duty cycles are up to 100 % or 255
+AS_PULSES = (
+    "pulses of servos in us are --command-unit counts --counts-per-turn 4000, if 1000 us turn a servo by 90 degrees"
+)
 METRES_UP_TO = 0.2  # largest plausible pull of a cable of a soft arm [m]
 
 
@@ -166,11 +170,12 @@ def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) ->
     if named is not None or not names:
         return named or Unit("mm")
     foreign = foreign_unit(table, names)
+    largest = float(np.nanmax(np.abs(values[list(names)].to_numpy())))
     if foreign is not None:
-        return Unit(foreign)
+        pulses = foreign == "%" and largest > SERVO_PULSE
+        return Unit(foreign, evidence=f"{_span(names)} reach {largest:.3g}: {AS_PULSES}" if pulses else "")
     if all(ANGLE.search(name) for name in names):
         return angle_unit(values, names)
-    largest = float(np.nanmax(np.abs(values[list(names)].to_numpy())))
     if all(FORCE.search(name) for name in names):
         return Unit("N", evidence=f"{_span(names)} are called forces, and reach {largest:.3g}")
     if all(PRESSURE.search(name) for name in names):

@@ -433,6 +433,16 @@ def test_counts_have_no_default_size(tmp_path, monkeypatch, capsys, words, messa
     assert message in told
 
 
+@pytest.mark.parametrize(("most", "said"), [(2060.0, True), (100.0, False)])
+def test_pulses_of_servos_are_no_duty_cycles(tmp_path, most, said):
+    run = table("t", "{marker}_{axis}_mm", "pwm{0}")
+    run[[f"pwm{k}" for k in range(1, 5)]] *= most / 0.4
+    run.to_csv(tmp_path / "run.csv", index=False)
+    guess = guess_columns(tmp_path / "run.csv")
+    assert guess.command_unit == "%"
+    assert ("--counts-per-turn 4000" in guess.evidence.get("command_unit", "")) == said
+
+
 def test_measured_angles_keep_the_unit_that_their_columns_tell(tmp_path, monkeypatch, capsys):
     run = table("t", "{marker}_{axis}_mm", "motor{0} [rad]")
     for k in range(1, 5):
