@@ -361,9 +361,17 @@ def _cables(ask: Questions, guess: Any, parts: int, cables: int | None, pairs: b
 
 
 def _markers(ask: Questions, guess: Any, given: str | None, length: float) -> dict[str, float]:
-    """Heights [mm] of the markers by name, in the order of the columns; evenly spaced if they are not given."""
+    """Heights [mm] of the markers by name, in the order of the columns.
+
+    Evenly spaced if they are not given, in this order, or from the tip on if each moves less than the one before.
+    """
+    from rfdropo_bayes.verbs.init import from_the_tip
+
     names = guess.markers if guess is not None else ["m1", "m2", "m3"]
-    spaced = ",".join(f"{name}={length * (k + 1) / len(names):.4g}" for k, name in enumerate(names))
+    steps = list(range(1, len(names) + 1))
+    if guess is not None and from_the_tip(guess):
+        steps.reverse()
+    spaced = ",".join(f"{name}={length * k / len(names):.4g}" for k, name in zip(steps, names, strict=True))
     text = ask.answer("markers", given, "Markers and their heights [mm]", spaced)
     heights: dict[str, float] = {}
     for part in text.split(","):

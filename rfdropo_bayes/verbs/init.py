@@ -32,7 +32,7 @@ from rfdropo_bayes.verbs.installation import DriveZero, installed_mechanisms, in
 from rfdropo_bayes.verbs.placement import frame_lines, moved_frame
 from rfdropo_bayes.verbs.registration import Frame, register
 from rfdropo_bayes.verbs.slow_motion import slow_motion
-from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, lengths_for_angles, unit_of_motion
+from rfdropo_bayes.verbs.unit_by_motion import bends_too_far, lengths_for_angles, spread, unit_of_motion
 
 NO_TIMES = "no column was recognised as times; give --sample-time if rows are evenly spaced in time"
 NO_MOTION = "rows have no times, so each is taken for a robot at rest"
@@ -130,6 +130,12 @@ def with_turns(guess: Guess) -> Guess:
     wraps = wraps_of(columns, Motion(rows, rows, guess.seen.reshape(len(rows), -1)))
     unwrap = {name: each.turn for name, each in wraps.items() if each.known}
     return guess._replace(unwrap=unwrap, sent=read_on(guess.sent, guess.commands, unwrap))
+
+
+def from_the_tip(guess: Guess) -> bool:
+    """Whether the columns of the markers go from the tip to the base: each moves less than the one before."""
+    motion = [spread(guess.seen[:, [number]]) for number in range(len(guess.markers))]
+    return len(motion) > 1 and bool(np.all(np.diff(motion) < 0.0))
 
 
 def of_robot(guess: Guess, outline: RobotOutline) -> Guess:

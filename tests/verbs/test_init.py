@@ -532,6 +532,18 @@ def test_heights_belong_to_the_markers_that_they_name(tmp_path, monkeypatch, cap
     assert load_recordings(experiment.data, tmp_path / "arm")[0].marker_names == ("low", "tip")
 
 
+@pytest.mark.parametrize("order", [["low", "tip"], ["tip", "low"]])
+def test_markers_that_move_less_from_column_to_column_go_down_the_body(tmp_path, monkeypatch, capsys, order):
+    run = table("t", "{marker}_{axis}_mm", "motor{0}")
+    run[["tip_x_mm", "tip_y_mm"]] *= 3.0
+    places = [f"{marker}_{axis}_mm" for marker in order for axis in "xyz"]
+    run[["t", *(f"motor{k}" for k in range(1, 5)), *places]].to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    assert init(monkeypatch, capsys, "arm", "--recording", "run.csv", "--length-mm", "200")[0] == 0
+    robot = Robot.load(tmp_path / "arm" / "arm.toml")
+    assert dict(zip(robot.marker_names, robot.marker_points()[:, 2], strict=True)) == {"low": 0.1, "tip": 0.2}
+
+
 def test_servos_that_rest_at_half_a_turn_are_said_and_centred_there(tmp_path, monkeypatch, capsys):
     run = table("t", "{marker}_{axis}", "goal_position_{0}")
     names = [f"goal_position_{k}" for k in range(1, 5)]
