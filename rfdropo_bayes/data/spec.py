@@ -21,7 +21,7 @@ from rfdropo_bayes.data.sofa_csv import read_sofa_csv
 from rfdropo_bayes.data.trajectory import Trajectory
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import find_files
-from rfdropo_bayes.tables import parse_table
+from rfdropo_bayes.tables import changed, parse_table
 
 Format = Literal[
     "sofa-csv", "optitrack-csv", "asl-csv", "csv", "motive-csv", "rosbag", "lerobot", "mat", "npz", "netcdf"
@@ -47,6 +47,9 @@ class RecordingEntry(BaseModel):
         default=None, description="numbers of a LeRobotDataset's episodes; all by default"
     )
     initial_command: InitialCommand = Field(default=None, description="command before the first row, as in [data]")
+    command_offset: float | None = Field(
+        default=None, description="command_offset of this recording, if the clocks of each begin apart"
+    )
 
 
 class DataSpec(BaseModel):
@@ -125,6 +128,7 @@ class _Source(NamedTuple):
     rows: tuple[int, int] | None
     every: int
     initial_command: InitialCommand
+    command_offset: float | None
     episode: int | None
 
     @property
@@ -210,7 +214,7 @@ def _sources(spec: DataSpec, entries: list[RecordingEntry], base: Path) -> Itera
             zero = entry.commands == NO_COMMANDS
             for episode in _episodes(spec, entry, match):
                 initial = spec.initial_command if entry.initial_command is None else entry.initial_command
-                yield _Source(match, commands, zero, entry.rows, entry.every, initial, episode)
+                yield _Source(match, commands, zero, entry.rows, entry.every, initial, entry.command_offset, episode)
 
 
 def _episodes(spec: DataSpec, entry: RecordingEntry, path: Path) -> list[int] | list[None]:
@@ -242,8 +246,10 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
             )
         return read_asl_csv(source.observations, source.commands, mask_missing=mask_missing)
     if spec.columns is not None:
+        offset = {} if source.command_offset is None else {"command_offset": source.command_offset}
+        columns = changed(spec.columns, where="[data.columns]", **offset)
         return read_mapped(
-            spec.format, source.observations, spec.columns, source.commands, source.episode, mask_missing=mask_missing
+            spec.format, source.observations, columns, source.commands, source.episode, mask_missing=mask_missing
         )
     return Trajectory.load(source.observations)
 

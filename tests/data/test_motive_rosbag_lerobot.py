@@ -111,6 +111,8 @@ def test_the_commands_clock_may_be_another(tmp_path):
     entry = {"observations": "take.csv", "commands": "sent.csv"}
     (recording,) = load(tmp_path, "motive-csv", entry, motive_columns(command_offset=0.25))
     check_motion(recording, MOTION)
+    (own,) = load(tmp_path, "motive-csv", {**entry, "command_offset": 0.25}, motive_columns(command_offset=100.0))
+    np.testing.assert_array_equal(own.command_time, recording.command_time)
     with fails("commands were sent from 99.756 to .* correct command_offset"):
         load(tmp_path, "motive-csv", entry, motive_columns(command_offset=100.0))
 
