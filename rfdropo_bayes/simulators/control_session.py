@@ -293,7 +293,11 @@ class Session:
         return jax.jit(jax.vmap(of_table))
 
     def _sent(self, commands: Float[np.ndarray, "lane channel"]) -> Float[np.ndarray, "lane step channel"]:
-        """Commands carried out by the drives in every step of the period, ramps and dead time included."""
+        """Commands carried out by the drives in every step of the period, ramps and dead time included.
+
+        A change in less than a step takes the step that follows: recorded changes are half a step earlier, see
+        `RobotSimulator.commands`, which a session cannot know ahead.
+        """
         past, time_step, (ramp, dead_time) = self._past, self.simulator.time_step, self.simulator.command_timing
         if self._travel is not None:
             self._forgotten, commands = self._travel.advance(self._forgotten, past.value[:, -1], commands)
