@@ -239,7 +239,6 @@ def audited(seed: int, folder: Path) -> dict[str, Any]:
     steps += [typed(command, folder) for command in commands]
     audit = json.loads((folder / "runs/audit/audit.json").read_text(encoding="utf-8"))
     summary = json.loads((folder / "runs/arm/summary.json").read_text(encoding="utf-8"))
-    sizes = {n: row["mean"] for finding in audit["findings"] for n, row in finding["parameters"].items()}
     return {
         "hidden": effect,
         "share_of_size": round(recorded.size, 3),
@@ -253,7 +252,7 @@ def audited(seed: int, folder: Path) -> dict[str, Any]:
         "verdict": audit["verdict"],
         "named": [finding["mechanism"] for finding in audit["findings"]],
         "classes": [finding["equivalence_class"] for finding in audit["findings"]],
-        "sizes": sizes,
+        "sizes": sizes_beside_truth(audit, effect, recorded.truth),
         "sentence": audit["sentence"],
         "fit_mm": [*summary["rmse"]["fit"].values()][-1],
         "test_mm": [*summary["rmse"]["test"].values()][-1],
@@ -262,6 +261,23 @@ def audited(seed: int, folder: Path) -> dict[str, Any]:
         "wall_s": {shlex.split(step.command)[1]: round(step.wall) for step in steps},
         "processor_s": {shlex.split(step.command)[1]: round(step.cpu) for step in steps},
     }
+
+
+def sizes_beside_truth(audit: dict[str, Any], effect: str, truth: dict[str, float]) -> list[dict[str, Any]]:
+    """Named sizes of the hidden effect: mean, 90 % interval and truth; over a power of Young's modulus if the data show
+    this ratio. Channels have other names in the files, and the same order.
+    """
+    rows = []
+    own = [value for name, value in truth.items() if name != "young_modulus"]
+    for finding in audit["findings"]:
+        if finding["mechanism"] == effect:
+            named = dict(zip(finding["parameters"], own, strict=True))
+            ratios = {row["parameter"]: row for row in finding["relative"].values()}
+            for name, row in (finding["parameters"] | ratios).items():
+                scale = truth["young_modulus"] ** -row["power"] if name in ratios else 1.0
+                interval = {key: row[key] for key in ("mean", "q05", "q95")}
+                rows.append({"name": row["title"], "truth": scale * named[name], **interval})
+    return rows
 
 
 def main() -> None:
