@@ -264,19 +264,21 @@ def audited(seed: int, folder: Path) -> dict[str, Any]:
 
 
 def sizes_beside_truth(audit: dict[str, Any], effect: str, truth: dict[str, float]) -> list[dict[str, Any]]:
-    """Named sizes of the hidden effect: mean, 90 % interval and truth; over a power of Young's modulus if the data show
-    this ratio. Channels have other names in the files, and the same order.
+    """Named sizes of the hidden effect: mean, 90 % interval and truth, in the form that the data show: over a power of
+    Young's modulus, or less the median of the channels. Channels have other names in the files, and the same order.
     """
-    rows = []
-    own = [value for name, value in truth.items() if name != "young_modulus"]
+    own, rows = [value for name, value in truth.items() if name != "young_modulus"], []
     for finding in audit["findings"]:
-        if finding["mechanism"] == effect:
-            named = dict(zip(finding["parameters"], own, strict=True))
-            ratios = {row["parameter"]: row for row in finding["relative"].values()}
-            for name, row in (finding["parameters"] | ratios).items():
-                scale = truth["young_modulus"] ** -row["power"] if name in ratios else 1.0
+        if finding["mechanism"] != effect:
+            continue
+        named = dict(zip(finding["parameters"], own, strict=True))
+        shown = {row["parameter"]: row for row in finding["relative"].values()}
+        for name, row in (finding["parameters"] | shown).items():
+            power = shown[name]["power"] if name in shown else None
+            size = named[name] - np.median(own) if power == 0 else named[name] * truth["young_modulus"] ** -(power or 0)
+            if row["sd"] > 0.0:
                 interval = {key: row[key] for key in ("mean", "q05", "q95")}
-                rows.append({"name": row["title"], "truth": scale * named[name], **interval})
+                rows.append({"name": row["title"], "truth": float(size), **interval})
     return rows
 
 
