@@ -15,7 +15,15 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.data.csv_layout import cells_of, dialect_of, header_of, table_lines, units_above, without_names
+from rfdropo_bayes.data.csv_layout import (
+    cells_of,
+    dialect_of,
+    header_of,
+    marker_block,
+    table_lines,
+    units_above,
+    without_names,
+)
 from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
@@ -96,6 +104,8 @@ class CsvTable:
     Values may be separated by commas, semicolons, tabs, bars or spaces, and decimals may follow a comma (`dialect_of`).
     Lines that a program wrote above the names are left out (`table_lines`).
     A second line of units is no row: ``units`` maps the names of columns to their units.
+    Of an export of Vicon's the trajectories are read: ``rate`` is their rows a second, ``left_out`` the titles of the
+    other blocks (`marker_block`).
 
     Args:
         path: the file, plain or gzipped.
@@ -110,6 +120,8 @@ class CsvTable:
 
     missing_remedy = "correct its name in [data.columns]"
     """Remedy for a missing column."""
+    rate: float | None = None
+    left_out: tuple[str, ...] = ()
 
     def __init__(
         self, path: Path, required: Sequence[str], *, names: Sequence[str] | None = None, machine_written: bool = True
@@ -144,6 +156,9 @@ class CsvTable:
             raise InputError("the file is empty", where=str(self.path), remedy="give a CSV with a header and rows")
         if len(lines) == 1:
             raise InputError("has a header but no rows", where=str(self.path), remedy="record or export it again")
+        lines, self.rate, self.left_out = marker_block(lines)
+        if len(lines) < 2:
+            raise InputError("has no trajectories", where=str(self.path), remedy="export it again, with its markers")
         lines = table_lines(lines)
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
@@ -290,7 +305,10 @@ class CsvTable:
 def _check_names(path: Path, names: Sequence[str]) -> None:
     repeated = sorted({name for name in names if name and names.count(name) > 1})  # spreadsheets add nameless columns
     if repeated:
-        raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
+        remedy = "rename one of them"
+        if repeated[0].lower() in ("x", "y", "z"):
+            remedy += ", such as tip_x and mid_x, or keep the line of the markers' names above them"
+        raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy=remedy)
 
 
 def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: int) -> None:
