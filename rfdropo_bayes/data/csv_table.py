@@ -6,6 +6,7 @@ import codecs
 import difflib
 import gzip
 import io
+import re
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
@@ -24,11 +25,14 @@ from rfdropo_bayes.data.csv_layout import (
     units_above,
     without_names,
 )
-from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
+from rfdropo_bayes.data.sample_times import PER_SECOND, Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
 HEAD = 100_000  # letters of a file that hold its first rows
 JSON = ("{", "[{", "[[")  # how JSON begins
+_SECONDS, _NANOSECONDS = (
+    re.compile(rf"(.*?){word}", re.IGNORECASE) for word in ("s(?:ecs?|econds)", "n(?:ano)?s(?:ecs?|econds)")
+)
 GIVE_CSV = "give a CSV file, plain or gzipped"
 MOTIVE = "Format Version"  # how the first line of an export of Motive's begins
 
@@ -213,11 +217,22 @@ class CsvTable:
         table.require(required)
         return table
 
+    @property
+    def joined(self) -> dict[str, tuple[str, str]]:
+        """Times in two columns, seconds and nanoseconds, as ROS writes them: the name for both, such as
+        "header.stamp.sec + header.stamp.nanosec", and the names of the two. They need no unit.
+        """
+        names = [str(name) for name in self.frame.columns]
+        fractions = {match[1]: name for name in names if (match := _NANOSECONDS.fullmatch(name))}
+        wholes = {name: match[1] for name in names if (match := _SECONDS.fullmatch(name))}
+        pairs = [(name, fractions[stem]) for name, stem in wholes.items() if stem in fractions]
+        return {f"{name} + {rest}": (name, rest) for name, rest in pairs}
+
     def __len__(self) -> int:
         return len(self.frame)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.frame.columns
+        return name in self.frame.columns or name in self.joined
 
     def require(self, names: Sequence[str]) -> None:
         """Raise an InputError if some ``names`` are not columns; it lists them and the nearest column to the first."""
@@ -265,10 +280,25 @@ class CsvTable:
         Raises:
             InputError: a cell that is empty, or neither a number nor a date.
         """
+        if name not in self.frame.columns and name in self.joined:
+            return self._joined_stamps(name)
         self.require([name])
         numbers, cells = self._number(self.frame[name]), self.frame[name]
         told = numbers.notna() | cells.isna()
         return read_stamps(numbers if told.all() else cells, unit, where=str(self.path), column=name)
+
+    def _joined_stamps(self, name: str) -> Stamps:
+        """Integer nanoseconds: a float of the seconds since 1970 would be coarse."""
+        seconds, rest = self.numbers(self.joined[name]).T
+        odd = (seconds % 1.0 != 0.0) | (rest % 1.0 != 0.0) | (rest < 0.0) | (rest >= PER_SECOND["ns"])
+        if odd.any():
+            row = int(np.argmax(odd))
+            raise InputError(
+                f"{seconds[row]:.15g} and {rest[row]:.15g} are no whole seconds and nanoseconds of a second",
+                where=f"{self.path}, row {row}, columns {name}",
+                remedy="correct the cells, or name one column of times",
+            )
+        return Stamps(seconds.astype(np.int64) * 10**9 + rest.astype(np.int64), PER_SECOND["ns"], False)
 
     def numeric(self, rows: int) -> pd.DataFrame:
         """The columns that hold nothing but numbers and empty cells in the first rows, as numbers."""

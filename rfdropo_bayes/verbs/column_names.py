@@ -152,7 +152,7 @@ def guess_columns(
     sample_time = None if time or whole.rate is None else 1.0 / whole.rate
     even = _even_clock(table) if time is None and sample_time is None and own else None
     time = time or even
-    columns = [str(name) for name in table.columns if name != time]
+    columns = [str(name) for name in table.columns if name not in (time, *whole.joined.get(str(time), ()))]
     triples, tensions, angles, free = _parts(columns, format)
     positions = list(triples.values())
     source, sending, clock = table, whole, None
@@ -160,7 +160,7 @@ def guess_columns(
         sending = CsvTable(sent, (), names=command_names, machine_written=False)
         _check_names(sending, command_names, "--command-names")
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
-        free = [str(name) for name in source.columns if name != clock]
+        free = [str(name) for name in source.columns if name not in (clock, *sending.joined.get(str(clock), ()))]
     measured = [] if sent is not None else angles or tensions
     commands = _commands(source, free, measured, any_name=own or sent is not None)
     if not positions:
@@ -275,7 +275,8 @@ def _measured_angles(
 
 
 def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers: Sequence[str]) -> list[str] | None:
-    """Names for the columns of a file without names: times, commands, and x, y and z of each marker.
+    """Names for the columns of a file without names: times, commands, and x, y and z of each marker; or those of a pose
+    that ``ros2 topic echo --csv`` wrote.
 
     None if the number of columns does not match.
 
@@ -285,6 +286,10 @@ def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers
         markers: their names.
     """
     width, places = len(rows[0]), [f"{marker}_{axis}" for marker in markers for axis in "xyz"]
+    frames = ["frame_id", "child_frame_id"][: sum(not is_value(cell) for cell in rows[0][2:])]
+    echoed = ["sec", "nanosec", *frames, *places, "qx", "qy", "qz", "qw"]
+    if frames and len(markers) == 1 and width == len(echoed) and all(cell.isdigit() for cell in rows[0][:2]):
+        return echoed
     rest = width - len(places)
     stamps = pd.to_numeric(pd.Series([row[0] for row in rows]), errors="coerce")
     clock = rest > 1 and (bool(stamps.diff().iloc[1] > 0.0) or (stamps.isna().all() and is_value(rows[0][0])))
@@ -324,7 +329,9 @@ def _measured(format: str, path: Path, names: Sequence[str] | None) -> tuple[Csv
 def _clock_of(table: CsvTable) -> str | None:
     """The first column whose name begins with a word for a time and that holds times; else the first with such a word
     or a unit of time in its name that rises: times that something took rise and fall."""
-    names = [str(name) for name in table.frame.columns]
+    joined = {name: parts for name, parts in table.joined.items() if _rises(table, name)}
+    parts = {part for two in joined.values() for part in two}
+    names = [*(str(name) for name in table.frame.columns if name not in parts), *joined]
     called = {name: _parted(name) for name in names if TIME.search(_parted(name))}
     first = (
         name for name, words in called.items() if TIME.match(words.lstrip(punctuation)) and _holds_times(table, name)

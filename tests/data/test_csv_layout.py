@@ -181,3 +181,17 @@ def test_a_sample_time_other_than_the_stated_rate_is_doubtful(tmp_path, sample_t
     found = read(tmp_path / "run.csv", VICON, time=None, sample_time=sample_time, **axes)
     np.testing.assert_allclose(found.time, sample_time * np.arange(3))
     assert any("the file says 50 Hz, and sample_time" in note for note in found.notes) == doubtful
+
+
+@pytest.mark.parametrize("names", ["header.stamp.sec,header.stamp.nanosec", "secs,nsecs"])
+def test_seconds_and_nanoseconds_are_one_column_of_times(tmp_path, names):
+    path = tmp_path / "run.csv"
+    stamps = ("1741700600,999999999", "1741700601,000000001", "1741700601,000000002")
+    rows = [f"{stamp},{','.join(map(str, row[1:]))}" for stamp, row in zip(stamps, ROWS, strict=True)]
+    path.write_text("\n".join([f"{names},u,x,y,z", *rows]) + "\n")
+    name = names.replace(",", " + ")
+    found = read_mapped("csv", path, parsed(time=name))
+    np.testing.assert_array_equal(found.time, [0.0, 2e-9, 3e-9])
+    path.write_text(path.read_text().replace("000000002", "1000000000"))
+    with pytest.raises(InputError, match=r"row 2.*1741700601 and 1000000000 are no whole seconds"):
+        CsvTable(path, (), machine_written=False).stamps(name, "s")
