@@ -109,7 +109,7 @@ class CsvTable:
     Lines that a program wrote above the names are left out (`table_lines`).
     A second line of units is no row: ``units`` maps the names of columns to their units.
     Of an export of Vicon's the trajectories are read: ``rate`` is their rows a second, ``left_out`` the titles of the
-    other blocks (`marker_block`).
+    other blocks (`marker_block`). Repeated lines of names are left out; ``notes`` tell their number.
 
     Args:
         path: the file, plain or gzipped.
@@ -126,6 +126,7 @@ class CsvTable:
     """Remedy for a missing column."""
     rate: float | None = None
     left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __init__(
         self, path: Path, required: Sequence[str], *, names: Sequence[str] | None = None, machine_written: bool = True
@@ -167,7 +168,11 @@ class CsvTable:
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
         header = header_of(self.path, lines, dialect.separator, names)
-        rows = lines if without_names(lines, dialect.separator) else lines[1:]
+        rows = lines if without_names(lines, dialect.separator) else [line for line in lines[1:] if line != lines[0]]
+        repeated = len(lines) - 1 - len(rows)
+        if repeated > 0:
+            times = "1 time" if repeated == 1 else f"{repeated} times"
+            self.notes = (f"the line of names stands {times} more below: left out, and not counted as rows",)
         units = units_above(rows, dialect.separator) or []
         self.units = {name: unit for name, unit in zip(header, units, strict=bool(units)) if unit}
         rows = rows[1:] if units else rows

@@ -347,6 +347,7 @@ def read_tables(
     commands = SentCommands(sent, command, *_channels(columns), command[0], _largest(columns))
     commands = commands.of_poses() if columns.commands_with_poses else commands
     notes = [*faults.notes, *_timing_notes(table, columns, time), *held]
+    notes += [note for file in {table.path: table, source.path: source}.values() for note in file.notes]
     if columns.command_time is not None:
         notes += command_notes(commands.command_time, commands.command)
     seen = np.where(faults.mask[:, :, None], position, np.nan).reshape(len(time), -1)

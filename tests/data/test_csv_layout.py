@@ -195,3 +195,12 @@ def test_seconds_and_nanoseconds_are_one_column_of_times(tmp_path, names):
     path.write_text(path.read_text().replace("000000002", "1000000000"))
     with pytest.raises(InputError, match=r"row 2.*1741700601 and 1000000000 are no whole seconds"):
         CsvTable(path, (), machine_written=False).stamps(name, "s")
+
+
+def test_a_repeated_line_of_names_is_left_out_and_counted(tmp_path):
+    lines = text().splitlines()
+    found = read(tmp_path / "run.csv", "\n".join([*lines[:2], lines[0], *lines[2:]]) + "\n")
+    check(found)
+    assert sum("the line of names stands 1 time more below" in note for note in found.notes) == 1
+    check(whole := read(tmp_path / "run.csv", text()))
+    assert not any("line of names" in note for note in whole.notes)

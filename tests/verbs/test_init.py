@@ -281,7 +281,10 @@ def test_a_file_without_positions_is_refused_with_the_names_that_are_recognised(
             run.filter(regex="t$|_").to_csv(index=False),
             r"no commands among .* low_z, .*; call .* commands motor1, motor2",
         ),
-        (text + text, r"no positions .*; text was left out, the first in row 40, column 't': 't'"),
+        (
+            text + ",".join(["again"] * len(run.columns)) + "\n",
+            r"no positions .*; text was left out, the first in row 40, column 't': 'again'",
+        ),
     ):
         path.write_text(table_text)
         with pytest.raises(InputError, match=message):
