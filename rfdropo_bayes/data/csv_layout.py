@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections import Counter
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,6 +28,18 @@ _UNITS = re.compile(
     r"%|percent|pct|pa|kpa|mpa|bar|mbar|psi|g|kg|k|°c|degc|c|-|1|(mm|cm|m|rad|deg|°)/s(\^?2)?",
     re.IGNORECASE,
 )
+_AXIS = re.compile(r"[xyz]'*", re.IGNORECASE)  # a name of a column that is an axis; ' of velocities, as Vicon writes
+TRAJECTORIES = "trajectories"  # title of the block of Vicon's export that holds the markers
+_TITLE = re.compile(r"([a-z][a-z ]*)[\s,;]*", re.IGNORECASE)  # spreadsheets fill lines up with separators
+_RATE = re.compile(r"(\d+\.?\d*)[\s,;]*(hz)?[\s,;]*", re.IGNORECASE)
+
+
+class Block(NamedTuple):
+    """The lines of the markers in an export of Vicon's; all lines of another file."""
+
+    lines: list[str]
+    rate: float | None = None  # rows a second, as the line below the title has it
+    others: tuple[str, ...] = ()  # titles of the other blocks
 
 
 class Dialect(NamedTuple):
@@ -57,11 +71,30 @@ def dialect_of(lines: Sequence[str]) -> Dialect:
     return Dialect(separator, "," if any(_COMMA.fullmatch(cell.strip()) for cell in told) else ".")
 
 
+def marker_block(lines: list[str]) -> Block:
+    """The block of trajectories in an export of Vicon's, without its title and rate: two lines begin each block."""
+    titles = {
+        row: title[1].strip()
+        for row in range(len(lines) - 1)
+        if (title := _TITLE.fullmatch(lines[row])) and _RATE.fullmatch(lines[row + 1])
+    }
+    start = next((row for row, title in titles.items() if title.lower() == TRAJECTORIES), None)
+    if start is None:
+        return Block(lines)
+    end = next((row for row in titles if row > start), len(lines))
+    rows = lines[start + 2 : end]
+    while rows and not rows[-1].strip(" ,;\t"):
+        rows.pop()
+    rate = float(_RATE.sub(r"\1", lines[start + 1]))
+    return Block(rows, rate or None, tuple(t for row, t in titles.items() if row != start))
+
+
 def table_lines(lines: Sequence[str]) -> list[str]:
     """The lines of a table from its names on, or from its rows on if no line names them.
 
     Programs write other lines above a table: comments, and lines of other widths. They are left out if no row of
-    values is among them. A comment sign in front of the names is removed.
+    values is among them. A comment sign in front of the names is removed. If the names are axes (X, Y, Z, X, Y, Z), the
+    line of markers above them is joined with them.
     """
     separator = dialect_of(["", *lines[-SAMPLED:]]).separator
     widths = Counter(len(cells_of(line, separator)) for line in lines[-SAMPLED:])
@@ -70,11 +103,43 @@ def table_lines(lines: Sequence[str]) -> list[str]:
     start = next(row for row, line in enumerate(bare) if len(cells_of(line, separator)) == width)
     while lines[start].lstrip().startswith(COMMENTS) and _is_header(lines[start + 1 : start + 2], separator, width):
         start += 1
+    start += _names_axes(lines[start + 1 : start + 2], separator, width)
     above = [line for line in lines[:start] if not line.lstrip().startswith(COMMENTS)]
     first = _MARKED.sub("", lines[start], count=1)
+    if start and _names_axes([first], separator, width):
+        first = _with_markers(lines[start - 1], first, separator)
     if any(_holds_values(line, separator) for line in above) or (above and not _is_header([first], separator, width)):
         return list(lines)
     return [first, *lines[start + 1 :]]
+
+
+def _names_axes(line: Sequence[str], separator: str, width: int) -> bool:
+    """Whether a line, if there is one, is a header with columns that are called x, y and z."""
+    return _is_header(line, separator, width) and set("xyz") <= {
+        cell.strip().lower() for cell in cells_of(line[0], separator)
+    }
+
+
+def _with_markers(above: str, axes: str, separator: str) -> str:
+    """A line of names, in which a marker's name precedes each of its axes, such as tip_X.
+
+    Markers' names stand above x, or above each of their axes; a line with words elsewhere names no markers. Subjects
+    (arm:tip) are left out if the markers' names differ without them.
+    """
+    names, over = ([cell.strip() for cell in cells_of(line, separator)] for line in (axes, above))
+    markers, marker = [], ""
+    for name, word in zip_longest(names, over[: len(names)], fillvalue=""):
+        axis = _AXIS.fullmatch(name)
+        if word and (len(over) == 1 or axis is None or (name[0] not in "xX" and word != marker)):
+            return axes
+        marker = (word or marker) if axis else ""
+        markers.append(marker)
+    bare = {marker: marker.rpartition(":")[2] for marker in markers}
+    bare = bare if len(set(bare.values())) == len(bare) else {marker: marker for marker in markers}
+    written = io.StringIO()
+    joined = [f"{bare[marker]}_{name}" if marker else name for marker, name in zip(markers, names, strict=True)]
+    csv.writer(written, delimiter=separator, lineterminator="").writerow(joined)
+    return written.getvalue()
 
 
 def _is_header(line: Sequence[str], separator: str, width: int) -> bool:

@@ -6,6 +6,7 @@ import codecs
 import difflib
 import gzip
 import io
+import re
 import zlib
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,12 +16,23 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from rfdropo_bayes.data.csv_layout import cells_of, dialect_of, header_of, table_lines, units_above, without_names
-from rfdropo_bayes.data.sample_times import Stamps, dated, numbers_of, read_stamps
+from rfdropo_bayes.data.csv_layout import (
+    cells_of,
+    dialect_of,
+    header_of,
+    marker_block,
+    table_lines,
+    units_above,
+    without_names,
+)
+from rfdropo_bayes.data.sample_times import PER_SECOND, Stamps, dated, numbers_of, read_stamps
 from rfdropo_bayes.errors import InputError
 
 HEAD = 100_000  # letters of a file that hold its first rows
 JSON = ("{", "[{", "[[")  # how JSON begins
+_SECONDS, _NANOSECONDS = (
+    re.compile(rf"(.*?){word}", re.IGNORECASE) for word in ("s(?:ecs?|econds)", "n(?:ano)?s(?:ecs?|econds)")
+)
 GIVE_CSV = "give a CSV file, plain or gzipped"
 MOTIVE = "Format Version"  # how the first line of an export of Motive's begins
 
@@ -96,6 +108,8 @@ class CsvTable:
     Values may be separated by commas, semicolons, tabs, bars or spaces, and decimals may follow a comma (`dialect_of`).
     Lines that a program wrote above the names are left out (`table_lines`).
     A second line of units is no row: ``units`` maps the names of columns to their units.
+    Of an export of Vicon's the trajectories are read: ``rate`` is their rows a second, ``left_out`` the titles of the
+    other blocks (`marker_block`). Repeated lines of names are left out; ``notes`` tell their number.
 
     Args:
         path: the file, plain or gzipped.
@@ -110,6 +124,9 @@ class CsvTable:
 
     missing_remedy = "correct its name in [data.columns]"
     """Remedy for a missing column."""
+    rate: float | None = None
+    left_out: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __init__(
         self, path: Path, required: Sequence[str], *, names: Sequence[str] | None = None, machine_written: bool = True
@@ -144,11 +161,18 @@ class CsvTable:
             raise InputError("the file is empty", where=str(self.path), remedy="give a CSV with a header and rows")
         if len(lines) == 1:
             raise InputError("has a header but no rows", where=str(self.path), remedy="record or export it again")
+        lines, self.rate, self.left_out = marker_block(lines)
+        if len(lines) < 2:
+            raise InputError("has no trajectories", where=str(self.path), remedy="export it again, with its markers")
         lines = table_lines(lines)
         dialect = dialect_of(lines)
         self.decimal = dialect.decimal
         header = header_of(self.path, lines, dialect.separator, names)
-        rows = lines if without_names(lines, dialect.separator) else lines[1:]
+        rows = lines if without_names(lines, dialect.separator) else [line for line in lines[1:] if line != lines[0]]
+        repeated = len(lines) - 1 - len(rows)
+        if repeated > 0:
+            times = "1 time" if repeated == 1 else f"{repeated} times"
+            self.notes = (f"the line of names stands {times} more below: left out, and not counted as rows",)
         units = units_above(rows, dialect.separator) or []
         self.units = {name: unit for name, unit in zip(header, units, strict=bool(units)) if unit}
         rows = rows[1:] if units else rows
@@ -198,11 +222,22 @@ class CsvTable:
         table.require(required)
         return table
 
+    @property
+    def joined(self) -> dict[str, tuple[str, str]]:
+        """Times in two columns, seconds and nanoseconds, as ROS writes them: the name for both, such as
+        "header.stamp.sec + header.stamp.nanosec", and the names of the two. They need no unit.
+        """
+        names = [str(name) for name in self.frame.columns]
+        fractions = {match[1]: name for name in names if (match := _NANOSECONDS.fullmatch(name))}
+        wholes = {name: match[1] for name in names if (match := _SECONDS.fullmatch(name))}
+        pairs = [(name, fractions[stem]) for name, stem in wholes.items() if stem in fractions]
+        return {f"{name} + {rest}": (name, rest) for name, rest in pairs}
+
     def __len__(self) -> int:
         return len(self.frame)
 
     def __contains__(self, name: str) -> bool:
-        return name in self.frame.columns
+        return name in self.frame.columns or name in self.joined
 
     def require(self, names: Sequence[str]) -> None:
         """Raise an InputError if some ``names`` are not columns; it lists them and the nearest column to the first."""
@@ -250,10 +285,25 @@ class CsvTable:
         Raises:
             InputError: a cell that is empty, or neither a number nor a date.
         """
+        if name not in self.frame.columns and name in self.joined:
+            return self._joined_stamps(name)
         self.require([name])
         numbers, cells = self._number(self.frame[name]), self.frame[name]
         told = numbers.notna() | cells.isna()
         return read_stamps(numbers if told.all() else cells, unit, where=str(self.path), column=name)
+
+    def _joined_stamps(self, name: str) -> Stamps:
+        """Integer nanoseconds: a float of the seconds since 1970 would be coarse."""
+        seconds, rest = self.numbers(self.joined[name]).T
+        odd = (seconds % 1.0 != 0.0) | (rest % 1.0 != 0.0) | (rest < 0.0) | (rest >= PER_SECOND["ns"])
+        if odd.any():
+            row = int(np.argmax(odd))
+            raise InputError(
+                f"{seconds[row]:.15g} and {rest[row]:.15g} are no whole seconds and nanoseconds of a second",
+                where=f"{self.path}, row {row}, columns {name}",
+                remedy="correct the cells, or name one column of times",
+            )
+        return Stamps(seconds.astype(np.int64) * 10**9 + rest.astype(np.int64), PER_SECOND["ns"], False)
 
     def numeric(self, rows: int) -> pd.DataFrame:
         """The columns that hold nothing but numbers and empty cells in the first rows, as numbers."""
@@ -290,7 +340,10 @@ class CsvTable:
 def _check_names(path: Path, names: Sequence[str]) -> None:
     repeated = sorted({name for name in names if name and names.count(name) > 1})  # spreadsheets add nameless columns
     if repeated:
-        raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy="rename one of them")
+        remedy = "rename one of them"
+        if repeated[0].lower() in ("x", "y", "z"):
+            remedy += ", such as tip_x and mid_x, or keep the line of the markers' names above them"
+        raise InputError(f"column {repeated[0]!r} appears twice", where=str(path), remedy=remedy)
 
 
 def _check_rectangular(path: Path, rows: Sequence[str], separator: str, fields: int) -> None:

@@ -66,6 +66,7 @@ CommandUnit = Literal[
 
 
 ROWS = "rows"  # stands for a column of times if rows have no times: the row number counts
+SAME_RATE = 1e-3  # share by which sample_time may differ from the rate that the file states
 ROW_SECONDS = 1.0  # nominal time from row to row [s] of rows without times
 UNTIMED = "rows have no times: one a second is assumed, which means nothing but for poses at rest"
 
@@ -346,6 +347,7 @@ def read_tables(
     commands = SentCommands(sent, command, *_channels(columns), command[0], _largest(columns))
     commands = commands.of_poses() if columns.commands_with_poses else commands
     notes = [*faults.notes, *_timing_notes(table, columns, time), *held]
+    notes += [note for file in {table.path: table, source.path: source}.values() for note in file.notes]
     if columns.command_time is not None:
         notes += command_notes(commands.command_time, commands.command)
     seen = np.where(faults.mask[:, :, None], position, np.nan).reshape(len(time), -1)
@@ -429,7 +431,13 @@ def _timing_notes(table: CsvTable, columns: CsvColumns, time: Float[np.ndarray, 
     if untimed(columns):
         return [UNTIMED]
     if columns.time is None:
-        return []
+        step = columns.sample_time
+        if table.rate is None or step is None or abs(step * table.rate - 1.0) < SAME_RATE:
+            return []
+        return [
+            f"the file says {table.rate:g} Hz, and sample_time = {step:g} is {1.0 / step:.4g} Hz: it is taken; "
+            "recordings at several rates need an experiment each"
+        ]
     repeated = repeated_rows(_from_first(table, columns.time, columns.time_unit))
     words = (
         f"{len(repeated)} of {len(table)} rows, first row {repeated[0]}, have the stamp of the row before: they are "

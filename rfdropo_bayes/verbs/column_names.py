@@ -65,8 +65,8 @@ NO_PLACE = re.compile(
     re.IGNORECASE,
 )
 """Columns in x, y and z that are no positions."""
-DERIVED = re.compile(r"(?<![a-z])[fvwq][_. ]?\*", re.IGNORECASE)
-"""The same under a single letter: forces, velocities and quaternions, if there are positions beside them."""
+DERIVED = re.compile(r"(?<![a-z])[fvwq][_. ]?\*|\*'", re.IGNORECASE)
+"""The same under a single letter, or with X' and X'', if there are positions beside them: forces, velocities, ..."""
 RATE = re.compile(r"veloc|effort|accel", re.IGNORECASE)
 BODY = re.compile(r"^Rigid Body\.|\.rigidbodies\[[^]]*\]\.pose", re.IGNORECASE)
 """Solved poses of bodies: if there are any, the underlying markers are not used."""
@@ -115,7 +115,7 @@ class Guess(NamedTuple):
     sent: Float[np.ndarray, "command channel"]  # commands of the first rows
     seen: Float[np.ndarray, "row marker 3"]  # marker positions in the first rows, both in the file's units
     counts_per_turn: float | None = None  # counts per turn of the spool, if a unit is "counts"
-    sample_time: float | None = None  # given time from row to row [s]; None for rows with times, or without any
+    sample_time: float | None = None  # time from row to row [s], given or of the file's rate; None if rows have times
     unwrap: Mapping[str, float] = {}  # turn of each counter that begins anew in the first rows, by its column
 
     @property
@@ -149,9 +149,10 @@ def guess_columns(
     _check_names(whole, names, "--names")
     table = whole.numeric(LOOKED_AT)
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
-    even = _even_clock(table) if time is None and own else None
+    sample_time = None if time or whole.rate is None else 1.0 / whole.rate
+    even = _even_clock(table) if time is None and sample_time is None and own else None
     time = time or even
-    columns = [str(name) for name in table.columns if name != time]
+    columns = [str(name) for name in table.columns if name not in (time, *whole.joined.get(str(time), ()))]
     triples, tensions, angles, free = _parts(columns, format)
     positions = list(triples.values())
     source, sending, clock = table, whole, None
@@ -159,7 +160,7 @@ def guess_columns(
         sending = CsvTable(sent, (), names=command_names, machine_written=False)
         _check_names(sending, command_names, "--command-names")
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
-        free = [str(name) for name in source.columns if name != clock]
+        free = [str(name) for name in source.columns if name not in (clock, *sending.joined.get(str(clock), ()))]
     measured = [] if sent is not None else angles or tensions
     commands = _commands(source, free, measured, any_name=own or sent is not None)
     if not positions:
@@ -188,13 +189,15 @@ def guess_columns(
         markers=_marker_names(list(triples), None if own else STRUCTURE),
         tensions=tensions,
         motor_angles=angles,
-        unused=[name for name in columns if name not in used],
+        unused=[name for name in columns if name not in used]
+        + [f"all of the block {title}" for title in whole.left_out],
         format=format,
         command_time=clock,
         units={**units["command_unit"].others, **units["position_unit"].others},
         names=None if names is None else list(names),
         command_names=None if command_names is None else list(command_names),
         evidence=({"time": EVEN} if even else {})
+        | ({"sample_time": f"the file says {whole.rate:g} Hz"} if sample_time else {})
         | {key: unit.evidence for key, unit in units.items() if unit.evidence},
         start=table[names_of(positions)].bfill().iloc[0].to_numpy(dtype=float).reshape(-1, 3),
         sent=source[commands].ffill().to_numpy(dtype=float),
@@ -204,6 +207,7 @@ def guess_columns(
         position_unit=units["position_unit"].unit,
         command_time_unit=units["command_time_unit"].unit,
         motor_angle_unit=units["motor_angle_unit"].unit,
+        sample_time=sample_time,
     )
 
 
@@ -271,7 +275,8 @@ def _measured_angles(
 
 
 def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers: Sequence[str]) -> list[str] | None:
-    """Names for the columns of a file without names: times, commands, and x, y and z of each marker.
+    """Names for the columns of a file without names: times, commands, and x, y and z of each marker; or those of a pose
+    that ``ros2 topic echo --csv`` wrote.
 
     None if the number of columns does not match.
 
@@ -281,6 +286,10 @@ def suggested_names(rows: Sequence[Sequence[str]], commands: int | None, markers
         markers: their names.
     """
     width, places = len(rows[0]), [f"{marker}_{axis}" for marker in markers for axis in "xyz"]
+    frames = ["frame_id", "child_frame_id"][: sum(not is_value(cell) for cell in rows[0][2:])]
+    echoed = ["sec", "nanosec", *frames, *places, "qx", "qy", "qz", "qw"]
+    if frames and len(markers) == 1 and width == len(echoed) and all(cell.isdigit() for cell in rows[0][:2]):
+        return echoed
     rest = width - len(places)
     stamps = pd.to_numeric(pd.Series([row[0] for row in rows]), errors="coerce")
     clock = rest > 1 and (bool(stamps.diff().iloc[1] > 0.0) or (stamps.isna().all() and is_value(rows[0][0])))
@@ -320,7 +329,9 @@ def _measured(format: str, path: Path, names: Sequence[str] | None) -> tuple[Csv
 def _clock_of(table: CsvTable) -> str | None:
     """The first column whose name begins with a word for a time and that holds times; else the first with such a word
     or a unit of time in its name that rises: times that something took rise and fall."""
-    names = [str(name) for name in table.frame.columns]
+    joined = {name: parts for name, parts in table.joined.items() if _rises(table, name)}
+    parts = {part for two in joined.values() for part in two}
+    names = [*(str(name) for name in table.frame.columns if name not in parts), *joined]
     called = {name: _parted(name) for name in names if TIME.search(_parted(name))}
     first = (
         name for name, words in called.items() if TIME.match(words.lstrip(punctuation)) and _holds_times(table, name)
@@ -476,6 +487,8 @@ def _ticks(table: CsvTable, name: str) -> np.ndarray:
 
 def _seconds(table: CsvTable, time: str | None, unit: str) -> float:
     """Length of a recording [s]; zero if unknown."""
+    if time is None and table.rate is not None:
+        return (len(table) - 1) / table.rate
     if time is None or time not in table:
         return 0.0
     stamps = table.stamps(time, unit)

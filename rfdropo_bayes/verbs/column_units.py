@@ -213,7 +213,7 @@ def time_unit(table: CsvTable, time: str | None, places: np.ndarray | None = Non
         time: column of times; None without times.
         places: positions of the markers in any unit, a row of coordinates for each time; None if unknown.
     """
-    if time is None or len(table) < 2:
+    if time is None or len(table) < 2 or time in table.joined:
         return Unit("s")
     stamps = table.stamps(time, "s")
     units = time_units_in_names(table, time)

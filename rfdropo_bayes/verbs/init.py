@@ -483,7 +483,9 @@ def _other_units(guess: Guess) -> list[str]:
 def _clock(guess: Guess) -> list[str]:
     """The times of the observations."""
     if guess.sample_time is not None:
-        return [f"sample_time = {guess.sample_time:g}  # seconds from row to row"]
+        stated = "sample_time" in guess.evidence
+        given = f"sample_time = {guess.sample_time:g}  # seconds from row to row"
+        return [_guessed_line(guess, "sample_time") if stated else given]
     if guess.time is None:
         return [f'time = "{ROWS}"  # ASSUMED: {NO_TIMES}']
     if guess.format == rosbag.FORMAT:

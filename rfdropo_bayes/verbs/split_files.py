@@ -44,7 +44,8 @@ def split_files(folder: Path, recordings: Sequence[Path], guess: Guess) -> dict[
             part = below / f"{path.name.partition('.')[0]}{name}_{count}.csv"
             _write(part, table, table.frame.iloc[start:end], named=guess.names is None)
             rows = ", ".join(str(row) for row in starts[1:])
-            found[part] = "" if number else f"{path.name} holds {len(starts)} recordings, split before rows {rows}"
+            words = f"{path.name} holds {len(starts)} recordings, split before rows {rows}"
+            found[part] = "" if number else "; ".join([words, *table.notes])
     return found
 
 

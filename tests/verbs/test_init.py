@@ -281,7 +281,10 @@ def test_a_file_without_positions_is_refused_with_the_names_that_are_recognised(
             run.filter(regex="t$|_").to_csv(index=False),
             r"no commands among .* low_z, .*; call .* commands motor1, motor2",
         ),
-        (text + text, r"no positions .*; text was left out, the first in row 40, column 't': 't'"),
+        (
+            text + ",".join(["again"] * len(run.columns)) + "\n",
+            r"no positions .*; text was left out, the first in row 40, column 't': 'again'",
+        ),
     ):
         path.write_text(table_text)
         with pytest.raises(InputError, match=message):
@@ -367,6 +370,16 @@ def test_the_unit_of_times_is_told_by_their_name_or_size(tmp_path, name, factor,
     guess = guess_columns(tmp_path / "run.csv")
     assert (guess.time, guess.time_unit) == (name, unit)
     assert name not in guess.unused
+
+
+def test_two_columns_of_a_stamp_are_times_and_never_commands(tmp_path):
+    path = tmp_path / "run.csv"
+    rows = [f"{1741700600 + k // 50},{20000000 * (k % 50)},{0.1 * k % 3},0.0,{k % 7},90" for k in range(120)]
+    path.write_text("\n".join(["sec,nanosec,a,tip_x,tip_y,tip_z", *rows]) + "\n")
+    guess = guess_columns(path)
+    assert (guess.time, guess.time_unit, guess.commands, guess.unused) == ("sec + nanosec", "s", ["a"], [])
+    assert "time_unit" not in guess.evidence
+    assert guess_columns(path, path).command_time == "sec + nanosec"
 
 
 def test_dates_are_times(tmp_path):
@@ -583,6 +596,12 @@ def test_positions_and_commands_may_be_two_files_without_names(tmp_path, monkeyp
         ([["9", "1", "2", "3", "4", "5"], ["8", "1", "2", "3", "4", "5"]], 5, ["a"], ""),
         ([["9", "1", "2"], ["8", "1", "2"]], None, ["a"], ""),
         ([["noon", "1", "2", "3", "4"], ["one", "1", "2", "3", "4"]], None, ["a"], "c1,c2,a_x,a_y,a_z"),
+        (
+            [["17", "20", "world", *"1230001"], ["17", "40", "world", *"1230001"]],
+            None,
+            ["tip"],
+            "sec,nanosec,frame_id,tip_x,tip_y,tip_z,qx,qy,qz,qw",
+        ),
     ],
 )
 def test_names_are_suggested_if_there_are_as_many_columns(rows, commands, markers, names):

@@ -85,6 +85,29 @@ def test_what_is_assumed_of_a_motive_export_is_marked(tmp_path, monkeypatch, cap
     assert "recordings of several formats" in told
 
 
+def test_a_trial_of_vicon_is_guessed_with_its_rate_and_the_blocks_that_are_left_out(tmp_path):
+    motion, path = swaying(), tmp_path / "trial.csv"
+    commands = commands_csv(motion, tmp_path / "sent.csv")
+    speed = [",".join("0" * 3)] * len(motion.time)
+    rows = [
+        f"{k + 1},0,{','.join(f'{1e3 * value:.6g}' for value in place.ravel())},{fast}"
+        for k, (place, fast) in enumerate(zip(motion.position, speed, strict=True))
+    ]
+    head = [
+        ",,arm:low,,,arm:tip,,,arm:tip,,",
+        "Frame,Sub Frame,X,Y,Z,X,Y,Z,X',Y',Z'",
+        ",," + 6 * "mm," + "mm/s,mm/s,mm/s",
+    ]
+    blocks = ["Devices", "1000", ",,Cell", "Frame,Sub Frame,Fz", ",,N", "1,0,3", ""]
+    path.write_text("\n".join([*blocks, "Trajectories", "50", *head, *rows]) + "\n")
+    guess = guess_columns(path, commands)
+    assert guess.positions == [["low_X", "low_Y", "low_Z"], ["tip_X", "tip_Y", "tip_Z"]]
+    assert (guess.markers, guess.position_unit) == (["low", "tip"], "mm")
+    assert (guess.time, guess.sample_time, guess.evidence["sample_time"]) == (None, 0.02, "the file says 50 Hz")
+    assert guess.unused[:2] == ["Frame", "Sub Frame"]
+    assert guess.unused[-1] == "all of the block Devices"
+
+
 @pytest.mark.parametrize("poses", ["stamped", "tf", "array", "mocap"])
 @pytest.mark.parametrize("commands", ["array", "joint", "single"])
 def test_topics_are_recognised(tmp_path, poses, commands):
