@@ -476,8 +476,8 @@ def _command_times(table: CsvTable, source: CsvTable, columns: CsvColumns) -> Fl
         raise InputError(
             f"commands were sent from {sent[0]:.6g} to {sent[-1]:.6g} s, and {last:.6g} s were recorded from 0 s on",
             where=where,
-            remedy="correct command_offset, of [data.columns] or of each entry, or pair files that were recorded together; "
-            'for a bag with stamps of several clocks write time = "log"',
+            remedy="correct command_offset, of [data.columns] or of each entry, or pair files that were recorded "
+            'together; for a bag with stamps of several clocks write time = "log"',
         )
     return sent
 

@@ -273,14 +273,8 @@ def write_first_files(
     seen = runs[0]
     bends = outline.sets_bend is not None
     scaled, stiff = ("length" in outline.assumed), ("young_modulus" in outline.assumed)
-    registration = register(
-        spec_of(placed, folder),
-        seen,
-        scaled=scaled,
-        bends=bends,
-        stiff=stiff,
-        zero=None if zero is None else zero.command,
-    )
+    straight = None if zero is None else zero.command
+    registration = register(spec_of(placed, folder), seen, scaled=scaled, bends=bends, stiff=stiff, zero=straight)
     ordered, order = guess, None
     if registration.arrangement is not None:
         turns = np.degrees(registration.arrangement.turns)
