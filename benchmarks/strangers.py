@@ -252,7 +252,7 @@ def audited(seed: int, folder: Path) -> dict[str, Any]:
         "verdict": audit["verdict"],
         "named": [finding["mechanism"] for finding in audit["findings"]],
         "classes": [finding["equivalence_class"] for finding in audit["findings"]],
-        "sizes": sizes_beside_truth(audit, effect, recorded.truth),
+        "sizes": sizes_beside_truth(audit, own, effect, recorded.truth),
         "sentence": audit["sentence"],
         "fit_mm": [*summary["rmse"]["fit"].values()][-1],
         "test_mm": [*summary["rmse"]["test"].values()][-1],
@@ -263,19 +263,25 @@ def audited(seed: int, folder: Path) -> dict[str, Any]:
     }
 
 
-def sizes_beside_truth(audit: dict[str, Any], effect: str, truth: dict[str, float]) -> list[dict[str, Any]]:
+def sizes_beside_truth(audit: dict[str, Any], own: Laboratory, effect: str, truth: dict[str, float]) -> list[Any]:
     """Named sizes of the hidden effect: mean, 90 % interval and truth, in the form that the data show: over a power of
-    Young's modulus, or less the median of the channels. Channels have other names in the files, and the same order.
+    Young's modulus, or less the median of the channels. Channels have other names and units in the files, and the same
+    order.
     """
-    own, rows = [value for name, value in truth.items() if name != "young_modulus"], []
+    rows, hidden = [], [name for name in truth if name != "young_modulus"]
+    arm = rb.Robot.outline(name="arm", **own.outline)
+    made = rb.Model(arm, priors={"young_modulus": {}}, mechanisms=[effect] if hidden else []).parameters.unit
     for finding in audit["findings"]:
         if finding["mechanism"] != effect:
             continue
-        named = dict(zip(finding["parameters"], own, strict=True))
+        named = {}
+        for name, (told, row) in zip(hidden, finding["parameters"].items(), strict=True):
+            wound = row["unit"].startswith("rad") and made[name].startswith("m")
+            named[told] = truth[name] / (own.spool if wound else 1.0)
         shown = {row["parameter"]: row for row in finding["relative"].values()}
         for name, row in (finding["parameters"] | shown).items():
-            power = shown[name]["power"] if name in shown else None
-            size = named[name] - np.median(own) if power == 0 else named[name] * truth["young_modulus"] ** -(power or 0)
+            power, size = shown[name]["power"] if name in shown else None, named[name]
+            size = size - np.median([*named.values()]) if power == 0 else size * truth["young_modulus"] ** -(power or 0)
             if row["sd"] > 0.0:
                 interval = {key: row[key] for key in ("mean", "q05", "q95")}
                 rows.append({"name": row["title"], "truth": float(size), **interval})
