@@ -64,7 +64,9 @@ class CommandTiming(RobotTable):
         'pressure, or "-" for drives with commands in volts or shares of their supply; channels.gain converts '
         'torques to newtons, and commands of "-" to newtons or pascals'
     )
-    ramp_s: float = Field(ge=0.0, description="a change of command is carried out linearly over this time")
+    ramp_s: float = Field(
+        ge=0.0, description="a change of command is carried out linearly over this time, or a time step"
+    )
     dead_time_s: float = Field(ge=0.0, description="time between a command and the start of its effect")
     usual: Positive | None = Field(
         default=None,

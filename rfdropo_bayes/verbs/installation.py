@@ -23,6 +23,7 @@ ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
 1.5 mm, and a slack of 2 mm on another day."""
 AWAY = 0.5  # least distance of a channel's commands from zero over their range if its drive has a zero of its own
+ALIKE = 0.05  # share of a channel's range by which the commands may differ at which recordings begin: measured, they do
 ORIGIN = 0.05  # standard deviation of the frame's origin over the body's length
 TILT, TURN = 0.1, 0.5
 """Standard deviations of the frame's tilt, and of its turn about the body's axis [rad]. That arm's frame was turned by
@@ -52,9 +53,9 @@ def zero_of_drives(recordings: Sequence[Trajectory], *, wraps: bool) -> DriveZer
     if not wraps and not away.all():
         return None
     first = np.array([run.command[0] for run in recordings])
-    if wraps or np.ptp(first, axis=0).any():
+    if wraps or (np.ptp(first, axis=0) > ALIKE * np.ptp(sent, axis=0)).any():
         return DriveZero(sent.mean(axis=0), "the mean of the commands")
-    return DriveZero(first[0], "the command at which recordings begin")
+    return DriveZero(first.mean(axis=0), "the command at which recordings begin")
 
 
 def largest_pull(robot: Robot, recording: Trajectory, zero: Float[np.ndarray, " channel"] | float = 0.0) -> float:
