@@ -5,8 +5,8 @@
 For each seed: an outline (length, taper, segments, cables, gravity), recordings of it under random commands with an
 effect of the library hidden, and CSV files in units and a frame of their own. Then the commands of the README are
 typed, from init to audit, and a line of OUT/ledger.jsonl says what was hidden and what the audit named. A seed whose
-line is there is not run again. The recordings come from our engine, with other time steps and elements than init
-chooses. An arm takes 3 to 20 minutes of a processor (yardstick 2.4).
+line is there is not run again; a command that fails is a verdict, too. The recordings come from our engine, with
+shorter time steps than init chooses. An arm takes 3 to 20 minutes of a processor (yardstick 2.4).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import argparse
 import json
 import shlex
 import shutil
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,7 +58,8 @@ EFFECTS = (
     "drive_zero_drift",
     "cable_gain_drift",
 )
-"""Hidden in turn, by seed: effects that init does not put into the model, and nothing in one arm of five."""
+"""Hidden in turn, by seed, and nothing in one arm of five. `init` has none of them in its model but for the tilt, if an
+arm lies."""
 SIZE = 3.0  # root mean square of what an effect moves the markers by, in deviations of the noise
 NEAR = 0.2  # relative tolerance of it
 TRIES = 8  # of the search for a size
@@ -221,10 +223,9 @@ def write_files(own: Laboratory, runs: Sequence[rb.Trajectory], seed: int, folde
     return " ".join(f"--{name}={value}" for name, value in options.items())
 
 
-def audited(seed: int, folder: Path) -> dict[str, Any]:
+def audited(seed: int, effect: str, folder: Path) -> dict[str, Any]:
     """Draw, record, type the README's commands; what was hidden and what was said."""
     own = draw_laboratory(np.random.default_rng([seed, 1]))
-    effect = EFFECTS[seed % len(EFFECTS)]
     recorded = record(own, effect, seed)
     options = write_files(own, recorded.runs, seed, folder / "data")
     steps = [typed(f'rfdropo init arm --recording "data/*.csv" {options} --defaults', folder)]
@@ -302,7 +303,12 @@ def main() -> None:
         if seed not in known:
             folder = given.runs / str(seed)
             shutil.rmtree(folder, ignore_errors=True)
-            row = audited(seed, folder)
+            effect = EFFECTS[seed % len(EFFECTS)]
+            try:
+                row = audited(seed, effect, folder)
+            except subprocess.CalledProcessError as error:
+                said = f"failed: {shlex.join(error.cmd[3:])}"
+                row = {"hidden": effect, "verdict": "failed", "classes": [], "sizes": [], "sentence": said}
             append_line(ledger, json.dumps({"seed": seed, **row}))
             print(f"{seed}: {row['hidden']} is hidden; {row['sentence']}", flush=True)
 

@@ -19,8 +19,14 @@ PASCALS = ("Pa", "kPa", "MPa", "mbar", "bar", "psi")
 FORCES = ("N", "N m", "V", "A", "%", "-")
 UNITS = ("mm", "cm", "m", "in", *ANGLES, *PASCALS, *FORCES)
 FOUND = (
-    *("test = ", "axes = ", "origin = ", "commands = ", "commands_with_poses = ", "unwrap = "),
-    *("[model.groups]", "# ASSUMED: drives"),
+    "test = ",
+    "axes = ",
+    "origin = ",
+    "commands = ",
+    "commands_with_poses = ",
+    "unwrap = ",
+    "[model.groups]",
+    "# ASSUMED: drives",
 )
 """Lines of an experiment file whose values `init` may find from a recording."""
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`

@@ -32,6 +32,9 @@ CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 sta
 STILL = 0.1  # quantile of the distances from row to row, which show the noise if the robot rests in some rows
 MOVES = 11.0  # such distances beyond which a robot moves: 5 deviations of a step of white noise
 PART = 0.1  # share of the way of the markers by which it moves then; more than creep under a held command
+AWAY = 0.5
+"""Least distance of a channel's commands from zero, over their range, if its drive has a zero of its own: 1.8 to 13 of
+servos in three files, 0 of cables that are pulled in."""
 MEMORY = "memory"  # the format of recordings from arrays
 UNTOLD = ("asl-csv", "csv", "motive-csv", "rosbag", "lerobot", MEMORY)
 """Formats that do not state the command before their first row."""
@@ -146,9 +149,15 @@ def recognised(trajectory: Trajectory) -> Beginning:
         return Beginning("zero", f"recognised: {evidence}")
     if first < CLEARLY * zero:
         return Beginning("first", f"recognised: {evidence}")
-    if (moved := moved_while_held(trajectory)) is not None:
+    moved = None if far_from_zero(trajectory.command) else moved_while_held(trajectory)
+    if moved is not None:
         return Beginning("zero", f"recognised: it moves by {1e3 * moved:.2g} mm while the first command is held")
     return Beginning(UNDECIDED, f"assumed: {evidence}, which does not decide")
+
+
+def far_from_zero(command: Float[np.ndarray, "command channel"]) -> bool:
+    """Whether no channel comes near zero: its drive has a zero of its own, as a servo that rests at 2048 counts."""
+    return bool((np.abs(command).min(axis=0) > AWAY * np.ptp(command, axis=0)).all())
 
 
 def moved_while_held(trajectory: Trajectory) -> float | None:

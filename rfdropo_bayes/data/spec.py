@@ -138,8 +138,8 @@ class _Source(NamedTuple):
 
     @property
     def key(self) -> tuple[Path, int | None, Path | None, str]:
-        """Identity of what is read: the recording, its commands, and the command before them."""
-        return self.observations, self.episode, self.commands, str(self.initial_command)
+        """Identity of what is read: the recording, its commands, their clock, and the command before them."""
+        return self.observations, self.episode, self.commands, str((self.initial_command, self.command_offset))
 
     def shares_rows(self, other: _Source) -> bool:
         """Whether a row belongs to both, parts of the same recording."""
@@ -228,6 +228,10 @@ def _episodes(spec: DataSpec, entry: RecordingEntry, path: Path) -> list[int] | 
 
 def _read(spec: DataSpec, source: _Source) -> Trajectory:
     mask_missing = spec.missing == "mask"
+    if source.command_offset is not None and spec.columns is None:
+        raise InputError(
+            f"format {spec.format!r} has a single clock", where=str(source.observations), remedy="drop command_offset"
+        )
     if spec.format in ("sofa-csv", "optitrack-csv", "netcdf") and source.commands is not None:
         raise InputError(
             f"format {spec.format!r} keeps the commands in the same file", where=str(source.commands), remedy="drop it"
@@ -246,8 +250,9 @@ def _read(spec: DataSpec, source: _Source) -> Trajectory:
             )
         return read_asl_csv(source.observations, source.commands, mask_missing=mask_missing)
     if spec.columns is not None:
-        offset = {} if source.command_offset is None else {"command_offset": source.command_offset}
-        columns = changed(spec.columns, where="[data.columns]", **offset)
+        columns = spec.columns
+        if source.command_offset is not None:
+            columns = changed(columns, where="[data.columns]", command_offset=source.command_offset)
         return read_mapped(
             spec.format, source.observations, columns, source.commands, source.episode, mask_missing=mask_missing
         )

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from rfdropo_bayes.data import Trajectory
+from rfdropo_bayes.data.first_command import far_from_zero
 from rfdropo_bayes.mechanisms.actuation import GuideAzimuth
 from rfdropo_bayes.mechanisms.sizes import scales_of
 from rfdropo_bayes.robots import Robot
@@ -22,7 +23,6 @@ from rfdropo_bayes.verbs.registration import UNSTATED, Frame, lies
 ZERO = 0.25
 """Standard deviation of the zero of a cable over the largest pull. A silicone arm that pulls 8 mm had zeros of up to
 1.5 mm, and a slack of 2 mm on another day."""
-AWAY = 0.5  # least distance of a channel's commands from zero over their range if its drive has a zero of its own
 ALIKE = 0.05  # share of a channel's range by which the commands may differ at which recordings begin: measured, they do
 ORIGIN = 0.05  # standard deviation of the frame's origin over the body's length
 TILT, TURN = 0.1, 0.5
@@ -49,8 +49,7 @@ def zero_of_drives(recordings: Sequence[Trajectory], *, wraps: bool) -> DriveZer
         wraps: whether commands are counts that begin anew after a turn, whose zero is anywhere.
     """
     sent = np.concatenate([run.command for run in recordings])
-    away = np.abs(sent).min(axis=0) > AWAY * np.ptp(sent, axis=0)
-    if not wraps and not away.all():
+    if not wraps and not far_from_zero(sent):
         return None
     first = np.array([run.command[0] for run in recordings])
     if wraps or (np.ptp(first, axis=0) > ALIKE * np.ptp(sent, axis=0)).any():

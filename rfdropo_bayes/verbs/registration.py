@@ -288,8 +288,9 @@ def register(
     arrangement = None if chosen.arrangement == start else chosen.arrangement
     if chosen.frame.explained < EXPLAINED:
         return Registration(None, arrangement, evidence)
-    # A swing that no rod at rest explains may be in phase with its motion, which it makes larger or smaller.
-    if 0.0 < abs(np.log(chosen.bend)) <= np.sqrt(chosen.unexplained):
+    # A swing that no rod at rest explains may be in phase with its motion, which it makes larger or smaller. Under
+    # forces the compliance sets the bend, and its prior is wide.
+    if not sights.held_by_force and 0.0 < abs(np.log(chosen.bend)) <= np.sqrt(chosen.unexplained):
         chosen = sights.of(chosen.arrangement, sights.rows, [(1.0, chosen.softness)]) or chosen
     return Registration(chosen.frame, arrangement, evidence, chosen.bend, chosen.softness)
 

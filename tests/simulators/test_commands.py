@@ -8,6 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rfdropo_bayes.errors import InputError
+from rfdropo_bayes.model.assembly import build_robot_simulator
+from rfdropo_bayes.model.model_spec import ModelSpec
+from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.simulators.commands import commands_on_grid, observed_at, sample, stack_commands
 
 
@@ -18,6 +21,22 @@ def grid(time, value, observed, **options):
 def test_a_held_command_acts_in_the_step_that_starts_with_it():
     commands = grid([0.0, 0.02], [1.0, 3.0], [0.0, 0.04], time_step=0.01)
     np.testing.assert_array_equal(commands.step[:, 0], [1.0, 1.0, 3.0, 3.0])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.37], ids=["at a step", "within a step"])
+@pytest.mark.parametrize("ramp", [0.0, 0.004, 0.1])
+def test_a_robot_carries_changes_out_neither_late_nor_early(share, ramp):
+    """The integral of a command that is linear in each step is that of the command that was sent, whatever the ramp is
+    below a step; a longer ramp is half of it late."""
+    robot = Robot.load("smooth_arm")
+    robot = robot.with_changes(command=robot.command.model_copy(update={"ramp_s": ramp, "dead_time_s": 0.0}))
+    simulator = build_robot_simulator(ModelSpec(robot))
+    step, channels = simulator.time_step, len(robot.channel_names)
+    time, level = step * np.array([0.0, 10.0, 20.0 + share]), np.array([1.0, 4.0, 2.0])
+    taken = simulator.commands(time, np.tile(level[:, None], channels), np.zeros(channels), step * np.arange(61.0))
+    path = np.concatenate([taken.initial[None], taken.step])[:, 0]
+    sent = step * (10.0 * level[0] + (10.0 + share) * level[1] + (40.0 - share) * level[2])
+    assert np.sum(0.5 * step * (path[1:] + path[:-1])) == pytest.approx(sent - 0.5 * ramp * level[-1], abs=1e-9)
 
 
 def test_an_observation_that_jitters_by_nanoseconds_belongs_to_the_step_that_ends_there():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -479,6 +480,8 @@ def test_the_numerical_error_of_step_and_mesh_is_said(monkeypatch):
     assert not found["sdirk2"].rest.enough
     monkeypatch.setattr(numerical_error, "measure_numerical_error", lambda spec, recording: found["euler"])
     lines = numerical_error_lines(demo_spec("euler"), demo())
+    sudden = replace(demo_spec("euler"), robot=demo_spec("euler").robot.without_command_timing())
+    assert [words for _, words in numerical_error_lines(sudden, demo())][1].endswith("ramp_s in the robot file")
     assert lines[0][0] == "numerics"
     assert "a quarter of the time step (10 ms, euler)" in lines[0][1]
     assert lines[1][1].startswith("twice the elements:")
