@@ -156,8 +156,11 @@ def recognised(trajectory: Trajectory) -> Beginning:
 
 
 def far_from_zero(command: Float[np.ndarray, "command channel"]) -> bool:
-    """Whether no channel comes near zero: its drive has a zero of its own, as a servo that rests at 2048 counts."""
-    return bool((np.abs(command).min(axis=0) > AWAY * np.ptp(command, axis=0)).all())
+    """Whether commands that change never come near zero in any channel: drives have a zero of their own, as servos that
+    rest at 2048 counts.
+    """
+    ranges = np.ptp(command, axis=0)
+    return bool(ranges.any() and (np.abs(command).min(axis=0) > AWAY * ranges).all())
 
 
 def moved_while_held(trajectory: Trajectory) -> float | None:

@@ -22,8 +22,8 @@ CLEARLY = 0.9  # ratio of the root mean square residuals of two maps below which
 
 APART = 0.3  # the same ratio of two neighbours' commands below which each row is a pose of its own
 UNSETTLED = 2.0
-"""Ratio of the residuals in rows after a change of the commands and in others beyond which bodies move: 1.1 at rest, 5.8
-if a twentieth of the way is left in the next row (20 pulls of 12 rows, noise of .02 mm)."""
+"""Ratio of the residuals in rows after a change of the commands and in others beyond which bodies move: 1.1 at rest,
+5.8 if a twentieth of the way is left in the next row (20 pulls of 12 rows, noise of .02 mm)."""
 
 
 class LagError(NamedTuple):

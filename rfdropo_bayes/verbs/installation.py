@@ -48,9 +48,9 @@ def zero_of_drives(recordings: Sequence[Trajectory], *, wraps: bool) -> DriveZer
         recordings: of one robot, with commands of imposed lengths.
         wraps: whether commands are counts that begin anew after a turn, whose zero is anywhere.
     """
-    sent = np.concatenate([run.command for run in recordings])
-    if not wraps and not far_from_zero(sent):
+    if not wraps and not all(far_from_zero(run.command) for run in recordings):
         return None
+    sent = np.concatenate([run.command for run in recordings])
     first = np.array([run.command[0] for run in recordings])
     if wraps or (np.ptp(first, axis=0) > ALIKE * np.ptp(sent, axis=0)).any():
         return DriveZero(sent.mean(axis=0), "the mean of the commands")

@@ -36,7 +36,7 @@ def run(unit: str, size: float, rows: int = 90) -> Trajectory:
     return recorded(unit, command)
 
 
-def recorded(unit: str, command: np.ndarray) -> Trajectory:
+def recorded(unit: str, command: np.ndarray, start: str = "zero") -> Trajectory:
     time = 0.1 * np.arange(len(command))
     return Trajectory.from_arrays(
         time=time,
@@ -47,7 +47,7 @@ def recorded(unit: str, command: np.ndarray) -> Trajectory:
         channels=tuple(f"c{k}" for k in range(4)),
         command=command,
         command_unit=unit,
-        initial_command="zero",
+        initial_command=start,
         name="run",
     )
 
@@ -99,14 +99,20 @@ def test_zeros_of_drives_that_count_from_anywhere_are_centred_at_the_mean_of_the
 def test_drives_that_never_come_near_zero_have_a_zero_of_their_own(rest, moved, zero):
     going = moved * np.random.default_rng(0).random((2, 90, 4))
     going[:, 0] = 0.01 * going[:, 1]  # the drives' places were measured
-    runs = [recorded("rad", rest + each) for each in going]
+    runs = [recorded("rad", rest + each, "first") for each in going]
     found = zero_of_drives(runs, wraps=False)
     assert (found is None) == (zero is None)
     if found is not None:
         np.testing.assert_allclose(found.command, zero, atol=0.01)
         assert found.words == "the command at which recordings begin"
-        elsewhere = [runs[0], recorded("rad", rest + going[1][::-1])]
+        elsewhere = [runs[0], recorded("rad", rest + going[1][::-1], "first")]
         assert zero_of_drives(elsewhere, wraps=False).words == "the mean of the commands"
+
+
+def test_steps_that_are_held_from_rest_on_are_no_zeros():
+    held = [recorded("rad", np.full((90, 4), level)) for level in (0.5, 0.9)]
+    assert zero_of_drives(held, wraps=False) is None
+    assert zero_of_drives([recorded("rad", np.full((90, 4), 0.5), "first")], wraps=False) is None
 
 
 def test_commands_that_never_move_leave_zeros_fixed():
