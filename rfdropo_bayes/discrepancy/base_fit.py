@@ -16,22 +16,19 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.audit_problem import AuditProblem, measurements_of, simulated
 from rfdropo_bayes.discrepancy.deadline import Deadline, OutOfTime, about
 from rfdropo_bayes.discrepancy.fit import (
-    WITHIN,
     Fit,
     FitTarget,
     base_optimum,
-    better_nearby,
     optimisation_rollouts,
-    optimise,
     optimum_rollouts,
     poll_rollouts,
+    polled,
     with_usable_differences,
 )
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.errors import InputError
 
-AGAIN = 3  # times that a base fit is continued from a better point beside it, before it counts as not converged
 # White noise of each channel in its own unit, until something better is known: millimetres, and the medians of priors.
 GUESSES = {"markers": 1e-3, "tension": 0.02, "motor_angle": 0.02, "object_pose": 5e-3, "orientation": 0.01}
 
@@ -109,17 +106,9 @@ def base_fits(
     smooth = with_usable_differences(target, first)
     if smooth.forward.lanes.difference != target.forward.lanes.difference:
         report(f"motion is rough: derivatives over relative steps of {smooth.forward.lanes.difference:g}")
-    fit_target, fit = fit_with_noise(smooth, first, free)
-    for _ in range(AGAIN):
+    fit_target, begun_fit = fit_with_noise(smooth, first, free)
+    for fit in polled(fit_target, begun_fit, "base model", report):
         yield Reached.at(fit_target, replace(fit, promise=np.inf))
-        better = better_nearby(fit_target, fit)
-        if better is None:  # for a motion with kinks, as with slack cables, slopes predict gains that do not exist
-            fit = replace(fit, promise=0.0) if fit.promise < WITHIN else fit
-            break
-        report(f"base model: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
-        fit = optimise(fit_target, better, free)
-    else:
-        fit = fit if better_nearby(fit_target, fit) is None else replace(fit, promise=np.inf)
     yield Reached.at(fit_target, fit) if known else Reached.at(*under_residual_noise(fit_target, fit))
 
 

@@ -8,7 +8,7 @@ model's optimum is searched as in `calibrate`: `inference.find_modes` starts at 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -47,6 +47,7 @@ OPTIMISED = 0.1
 POLLED = (0.3, 0.03, 0.003)  # trial deviations of the prior to each side of an optimum
 ALONG = (4.0, 2.0, 1.0, 0.3)  # trial deviations of the posterior along its principal axes
 WITHIN = 0.5 * max(ALONG) ** 2  # predicted gain [nat] of a step no longer than the trial steps
+AGAIN = 3  # times that a fit is continued from a better point beside it, before it counts as not converged
 FAILED = 1e6  # whitened residual of a rollout that failed: no step is ever taken there
 
 
@@ -563,6 +564,19 @@ def with_usable_differences(target: FitTarget, x: Float[np.ndarray, " d"]) -> Fi
 
     step = usable_difference(slope)
     return target if step <= usual else replace(target, forward=target.forward.with_difference(step))
+
+
+def polled(target: FitTarget, fit: Fit, name: str, report: Callable[[str], None]) -> Iterator[Fit]:
+    """A fit, continued from better points beside it; rollouts confirm the last, or it has not converged."""
+    for _ in range(AGAIN):
+        yield fit
+        better = better_nearby(target, fit)
+        if better is None:  # for a motion with kinks, as with slack cables, slopes predict gains that do not exist
+            yield replace(fit, promise=0.0) if fit.promise < WITHIN else fit
+            return
+        report(f"{name}: sum of squares {fit.residual @ fit.residual:.0f}, and better beside it")
+        fit = optimise(target, better, fit.free)
+    yield fit if better_nearby(target, fit) is None else replace(fit, promise=np.inf)
 
 
 def better_nearby(target: FitTarget, fit: Fit) -> Float[np.ndarray, " d"] | None:

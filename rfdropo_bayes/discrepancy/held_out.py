@@ -17,7 +17,7 @@ from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise
 from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, measure_gain
 from rfdropo_bayes.discrepancy.inadequacy import as_measured, residual_deviation
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.discrepancy.naming import Named
+from rfdropo_bayes.discrepancy.naming import Named, without_each_other
 from rfdropo_bayes.discrepancy.port_rollouts import with_laws_of
 from rfdropo_bayes.discrepancy.repairs import without
 from rfdropo_bayes.errors import NoLikelihoodError
@@ -234,6 +234,14 @@ class Kept:
     held_out: HeldOut | None
     unsupported: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, asked: Named, named: Named, held_out: HeldOut | None) -> Kept:
+        """What is kept of the named causes; a cause that is not kept may be a rival of those that are."""
+        unsupported = tuple(name for name in asked.names if name not in named.names)
+        if unsupported:
+            asked.search.report(f"unseen recordings do not support {' and '.join(unsupported)}")
+        return cls(replace(named, steps=without_each_other(named.steps)), held_out, unsupported)
+
 
 def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
     """The steps supported by unseen recordings: first from predictions of all steps, then without steps that depend on
@@ -254,23 +262,16 @@ def keep_supported(problem: AuditProblem, named: Named) -> Iterator[Kept]:
             fewer = named
         supported = held_out.supported()
         if not fewer.steps or not supported:
-            yield _kept(named, fewer, held_out if fewer.steps else None)
+            yield Kept.of(named, fewer, held_out if fewer.steps else None)
             return
         if supported < len(fewer.steps):
             before = fewer.steps[supported].before
             fewer = replace(fewer, steps=fewer.steps[:supported], tests=before, tried=None)
-        yield _kept(named, fewer, held_out.after(supported))
+        yield Kept.of(named, fewer, held_out.after(supported))
         remaining, measured = _without_carried(problem, fewer, held_out.after(supported))
         if len(remaining.steps) < len(fewer.steps):
             remaining = replace(remaining, tests=remaining.asked.tested(remaining.fit, len(remaining.steps)))
-        yield _kept(named, remaining, measured)
-
-
-def _kept(asked: Named, named: Named, held_out: HeldOut | None) -> Kept:
-    unsupported = tuple(name for name in asked.names if name not in named.names)
-    if unsupported:
-        asked.search.report(f"unseen recordings do not support {' and '.join(unsupported)}")
-    return Kept(named, held_out, unsupported)
+        yield Kept.of(named, remaining, measured)
 
 
 def _without_carried(problem: AuditProblem, named: Named, held_out: HeldOut) -> tuple[Named, HeldOut]:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, polled
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.repairs import optimised_again, paying_pair, simplified
 from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
@@ -108,6 +108,9 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
         if named.steps:  # the last model has the noise of its present residuals
             fit_target, fit = fit_with_noise(named.fit_target.measured, named.fit.x, named.fit.free)
             named = named.extended([*named.steps[:-1], replace(named.steps[-1], fit=fit, fit_target=fit_target)])
+            with clock.stage("refits"):
+                *_, settled = polled(fit_target, fit, f"with {named.names[-1]}", report)
+            named = named.with_better(settled)
         tests = named.asked.score_tests(named.fit, named.names)
         named = replace(named, tests=tests)
         yield named

@@ -33,7 +33,7 @@ from rfdropo_bayes.discrepancy.gain import Gain, Unseen, UnseenErrors, noise_dis
 from rfdropo_bayes.discrepancy.held_out import HeldOut, Kept, keep_supported
 from rfdropo_bayes.discrepancy.inadequacy import as_measured, leaves_noise, residual_deviation
 from rfdropo_bayes.discrepancy.journal import Journal
-from rfdropo_bayes.discrepancy.naming import Named, name_causes, without_each_other
+from rfdropo_bayes.discrepancy.naming import Named, name_causes
 from rfdropo_bayes.discrepancy.prior_ends import decided_by_priors
 from rfdropo_bayes.discrepancy.remainder import Remainder, describe_remainder
 from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
@@ -279,7 +279,7 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
         yield results
     results = results.after(CAUSES)
     kept = Kept(named, None)
-    for each_kept in keep_supported(problem, replace(named, steps=without_each_other(named.steps))):
+    for each_kept in keep_supported(problem, named):
         kept, results = each_kept, replace(results, kept=each_kept)
         yield results
     last = kept.named
@@ -384,10 +384,9 @@ def _kept_in_time(results: Results, clock: Deadline) -> Kept:
             ExtensionSearch(target, results.problem.candidates, results.problem.rules, results.problem.seed), base
         )
     named = named.with_best()
-    named = replace(named, steps=without_each_other(named.steps))
     if named.tests is None:
         named = replace(named, tests=named.asked.tested(named.fit, len(named.steps)))
-    kept = Kept(named, None)
+    kept = Kept.of(named, named, None)
     with suppress(OutOfTime), clock.granted():
         kept = next(iter(keep_supported(results.problem, named)))
     return kept

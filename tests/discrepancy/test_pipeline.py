@@ -28,8 +28,9 @@ from rfdropo_bayes.discrepancy.candidates import lead, probe_all
 from rfdropo_bayes.discrepancy.deadline import Deadline
 from rfdropo_bayes.discrepancy.experiment_design import Hypothesis, at_hand, outlooks
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits, Rules
-from rfdropo_bayes.discrepancy.fit import optimise
+from rfdropo_bayes.discrepancy.fit import optimise, polled
 from rfdropo_bayes.discrepancy.gain import Difference, Gain
+from rfdropo_bayes.discrepancy.held_out import Kept
 from rfdropo_bayes.discrepancy.journal import Journal
 from rfdropo_bayes.discrepancy.measurements import gather_measurements
 from rfdropo_bayes.discrepancy.naming import Named, without_each_other
@@ -542,6 +543,25 @@ def test_a_rival_that_joins_the_model_later_is_no_rival_any_more():
     rest = {"before": None, "fit": None, "log_bayes_factor": 5.0, "refits": {}, "fit_target": None}
     steps = [Added("play", ("play", "creep", "wall"), **rest), Added("creep", ("creep", "lag"), **rest)]
     assert [step.members for step in without_each_other(steps)] == [("play", "wall"), ("creep", "lag")]
+    asked = problem(TRUTH, 1)
+    target, base = base_model(asked, 0)
+    both = Named(ExtensionSearch(target, asked.candidates, asked.rules, 0), base, tuple(steps))
+    first = Kept.of(both, both.extended(steps[:1]), None)
+    assert (first.unsupported, first.named.steps[0].members) == (("creep",), ("play", "creep", "wall"))
+
+
+def test_a_fit_with_better_points_beside_it_goes_on_from_them():
+    asked = problem({**TRUTH, "play": 1.0}, 1)
+    target, base = base_model(asked, 0)
+    play = next(c for c in asked.candidates if c.name == "play")
+    with_play = np.array([*base.free, *play.indices], dtype=int)
+    early, whole = (optimise(target, base.x, with_play, **end) for end in ({"evaluations": 0}, {}))
+    said = []
+    first, *_, last = polled(target, early, "with play", said.append)
+    assert first is early
+    assert said[0].startswith("with play: sum of squares")
+    assert last.converged
+    assert last.log_evidence == pytest.approx(whole.log_evidence, abs=0.1)
 
 
 @pytest.mark.slow
