@@ -35,6 +35,10 @@ BENDS = tuple(np.geomspace(1.0 / 8.0, 8.0, 13))
 """Factors of the bend of a command that are tried if no answer sets it, a factor of 1.4 apart. An arm whose cables lie
 at half the assumed distance, and whose spool is a guess, bent 2.1 times as far."""
 
+REACHED = 1.5
+"""Factor of a bend that the priors of gains and spools reach, so that a calibration finds it from motion. Of 13 arms
+that move, whose cables lie where `init` assumes, a rod at rest of guessed stiffness had moved them by 1.33 in four."""
+
 ENOUGH = 0.99  # share at or above which no exchange of channels is looked for
 LIKELY = 4  # exchanges that are looked at with all compliances
 ACROSS = 0.1  # least share of gravity across the body that shows the azimuth of the cables
@@ -288,9 +292,9 @@ def register(
     arrangement = None if chosen.arrangement == start else chosen.arrangement
     if chosen.frame.explained < EXPLAINED:
         return Registration(None, arrangement, evidence)
-    # A swing that no rod at rest explains may be in phase with its motion, which it makes larger or smaller. Under
-    # forces the compliance sets the bend, and its prior is wide.
-    if not sights.held_by_force and 0.0 < abs(np.log(chosen.bend)) <= np.sqrt(chosen.unexplained):
+    # The swing of a body, or a compliance that is a guess, makes its motion larger or smaller than a rod's at rest. A
+    # length that is not known depends on the bend. Under forces the compliance sets it, and its prior is wide.
+    if not (sights.held_by_force or scaled) and 0.0 < abs(np.log(chosen.bend)) <= np.log(REACHED):
         chosen = sights.of(chosen.arrangement, sights.rows, [(1.0, chosen.softness)]) or chosen
     return Registration(chosen.frame, arrangement, evidence, chosen.bend, chosen.softness)
 
