@@ -43,11 +43,8 @@ def simulated_data(problem: CalibrationProblem, truth: Mapping[str, float], key:
 
 
 def with_measured(problem: CalibrationProblem, measured: Measured) -> CalibrationProblem:
-    """The same problem with other data.
-
-    Its Jacobians are central differences of compiled rollouts, because a derivative would be compiled anew.
-    """
-    return replace(problem, other=measured, jacobian="central")
+    """The same problem with other data."""
+    return replace(problem, other=measured)
 
 
 def drawn(channel: Channel, key: PRNGKeyArray, seen: Seen) -> Float[Any, "..."]:

@@ -40,7 +40,6 @@ class CalibrationProblem:
     other: Measured | None = None  # measured data in place of the model's data; None for the model's
     # factors of the log likelihood of some channels; the other factors are 1
     counted: Mapping[str, float] = field(default_factory=dict)
-    jacobian: str = "auto"  # method of Jacobians, see `ResidualProblem`
     # called with the number of rollouts, in full-length equivalents, after each chunk
     count_rollouts: Callable[[float], None] = lambda rollouts: None
 
@@ -48,6 +47,14 @@ class CalibrationProblem:
     def names(self) -> tuple[str, ...]:
         """Labels of the inferred parameters, in sampling order."""
         return self.model.scopes.names
+
+    @property
+    def jacobian(self) -> str:
+        """Method of Jacobians: differences of batches of rollouts on the compiled engine, whose derivative along a
+        tangent is a difference as well, and takes 20 to 40 s to compile.
+        """
+        backend = getattr(getattr(self.model.simulator, "engine", None), "backend", None)
+        return "central" if backend is not None and backend.name == "numba" else "auto"
 
     @property
     def measured(self) -> Measured:

@@ -196,7 +196,7 @@ def optimisation_cost(d: int, noise: int) -> tuple[float, float]:
     """Rollouts for the start of an optimisation and for each of its steps, with ``d`` coordinates and ``noise`` noise
     coordinates: the grid of the noise; the value, a Jacobian by central differences, two more per noise, all dampings.
     """
-    return float(NOISE_GRID * noise), 4.0 * d + 1.0 + len(DAMPINGS)
+    return float(NOISE_GRID * noise), 2.0 * (d + noise) + 1.0 + len(DAMPINGS)
 
 
 def laplace(target: Optimisable, state: LevenbergState) -> Laplace:
