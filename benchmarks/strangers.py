@@ -1,12 +1,13 @@
 """What does an audit find in the files of a laboratory that nobody knows? Arms, files and effects are drawn at random.
 
-    python benchmarks/strangers.py SEED ... [--out reports/strangers] [--runs runs/strangers]
+    python benchmarks/strangers.py SEED ... [--at-rest] [--out OUT] [--runs runs/strangers]
 
 For each seed: an outline (length, taper, segments, cables, gravity), recordings of it under random commands with an
-effect of the library hidden, and CSV files in units and a frame of their own. Then the commands of the README are
-typed, from init to audit, and a line of OUT/ledger.jsonl says what was hidden and what the audit named. A seed whose
-line is there is not run again; a command that fails is a verdict, too. The recordings come from our engine, with
-shorter time steps than init chooses. An arm takes 3 to 20 minutes of a processor (yardstick 2.4).
+effect of the library hidden, and CSV files in units and a frame of their own; with --at-rest poses without times.
+Then the commands of the README are typed, from init to audit, and a line of OUT/ledger.jsonl says what was hidden and
+what the audit named. A seed whose line is there is not run again; a command that fails is a verdict, too. The
+recordings come from our engine, with shorter time steps or elements than init chooses. An arm in motion takes 3 to 20
+minutes of a processor, at rest 1 to 5 (yardstick 2.4).
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ import json
 import shlex
 import shutil
 import subprocess
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pandas as pd
 from fifteen_minutes import typed
@@ -60,10 +63,34 @@ EFFECTS = (
 )
 """Hidden in turn, by seed, and nothing in one arm of five. `init` has none of them in its model but for the tilt, if an
 arm lies."""
+EFFECTS_AT_REST = (
+    NOTHING,
+    "cable_gain",
+    "payload",
+    "stiffness_gradient",
+    NOTHING,
+    "base_tilt",
+    "cable_compliance",
+    "camera_scale",
+    "guide_azimuth",
+    NOTHING,
+    "soft_part",
+    "base_compliance",
+    "backlash",
+    "marker_offset",
+    NOTHING,
+    "capstan_friction",
+    "fibre_law",
+    "cable_slack",
+    "plane_anisotropy",
+)
+"""The same for poses at rest."""
+HIDDEN = {"motion": EFFECTS, "at_rest": EFFECTS_AT_REST}
 SIZE = 3.0  # root mean square of what an effect moves the markers by, in deviations of the noise
 NEAR = 0.2  # relative tolerance of it
 TRIES = 8  # of the search for a size
 MINUTES = 15  # of an audit, at most
+UNREACHED = "unreached"  # verdict if no size of an effect reaches SIZE
 
 
 class Laboratory(NamedTuple):
@@ -71,14 +98,16 @@ class Laboratory(NamedTuple):
 
     Attributes:
         outline: arguments of `Robot.outline`.
+        rests: whether poses at rest are recorded, instead of motion.
         damping: stiffness damping [s].
         ramp: time that drives take for a change [s], which the laboratory writes into the robot file.
-        walk: random commands.
+        walk: random commands; at rest the number of poses in a file, and the largest pull [m].
         noise: standard deviation of positions [m].
         unit: of commands: "mm", "deg" or "counts"; spool: radius [m] of the spools.
     """
 
     outline: dict[str, Any]
+    rests: bool
     damping: float
     ramp: float
     walk: dict[str, Any]
@@ -86,9 +115,41 @@ class Laboratory(NamedTuple):
     unit: str
     spool: float
 
+    @property
+    def robot(self) -> rb.Robot:
+        """The arm, whose drives take `ramp` for a change in motion."""
+        arm = rb.Robot.outline(name="arm", **self.outline)
+        ramp = {"ramp_s": 0.0 if self.rests else self.ramp}
+        return arm.with_changes(command=arm.command.model_copy(update=ramp))
 
-def draw_laboratory(rng: np.random.Generator) -> Laboratory:
-    """Draw an arm that bears itself, moves at 1 to 4 Hz, and follows commands within its bending range."""
+    def commands(self, seed: int) -> Sequence[rb.Trajectory] | dict[str, Any]:
+        """Random commands; at rest each segment bends into a random direction, by what its cables there can."""
+        if not self.rests:
+            return self.walk
+        robot, rng, runs = self.robot, np.random.default_rng([seed, 4]), []
+        time, segments = np.arange(float(self.walk["poses"])), self.outline["segments"]
+        azimuth = np.deg2rad([cable.azimuth_deg for cable in robot.cables]).reshape(1, segments, -1)
+        for name in "01":
+            towards = rng.uniform(0.0, 2.0 * np.pi, (len(time), segments, 1))
+            bend = rng.uniform(0.0, self.walk["high"], towards.shape)
+            run = rb.Trajectory.from_arrays(
+                time=time,
+                position=np.tile(robot.marker_points(), (len(time), 1, 1)),  # until they are simulated
+                command=(bend * np.maximum(np.cos(azimuth - towards), 0.0)).reshape(len(time), -1),
+                command_time=time - 0.5,
+                markers=robot.marker_names,
+                channels=robot.channel_names,
+                name=name,
+            )
+            runs.append(run)
+        return runs
+
+
+def draw_laboratory(rng: np.random.Generator, rests: bool) -> Laboratory:
+    """Draw an arm that bears itself, moves at 1 to 4 Hz, and follows commands within its bending range.
+
+    At rest it takes 120 to 320 poses in two files, whose cables bend a segment by .8 to 1.8 rad.
+    """
     length = float(np.exp(rng.uniform(np.log(0.08), np.log(0.6))))
     radius, cone = length * float(rng.uniform(0.03, 0.09)), bool(rng.random() < 0.5)
     gravity = str(rng.choice(["+z", "+z", "-z", "+x", "-y"]))
@@ -123,59 +184,59 @@ def draw_laboratory(rng: np.random.Generator) -> Laboratory:
         "sample_time": 1.0 / rate,
         "recordings": [str(k) for k in range(number)],
     }
+    if rests:
+        bend = float(rng.uniform(0.8, 1.8)) * 0.75 * radius * (0.75 if cone else 1.0)
+        walk = {"poses": int(rng.choice([60, 100, 160])), "high": bend}
     noise = length * float(np.exp(rng.uniform(np.log(5e-4), np.log(2e-3))))
     unit, spool = str(rng.choice(["mm", "counts", "deg"])), float(rng.uniform(0.006, 0.02))
     damping, ramp = float(rng.uniform(0.02, 0.08)), round(float(rng.uniform(0.05, 0.15)), 3)
-    return Laboratory(outline, damping, ramp, walk, noise, unit, spool)
+    return Laboratory(outline, rests, damping, ramp, walk, noise, unit, spool)
 
 
 class Recorded(NamedTuple):
-    """Recordings, true values of the parameters, and the share of `SIZE` that the effect has."""
+    """Recordings, measured positions [m] of each, true values, and the share of `SIZE` that the effect has."""
 
     runs: Sequence[rb.Trajectory]
+    positions: list[np.ndarray]
     truth: dict[str, float]
     size: float
 
 
-def record(own: Laboratory, effect: str, seed: int) -> Recorded:
-    """Recordings with an effect that moves the markers by `SIZE` deviations of the noise.
-
-    Raises:
-        RuntimeError: no size does.
-    """
-    rng = np.random.default_rng([seed, 2])
-    outlined = rb.Robot.outline(name="arm", **own.outline)
-    arm = outlined.with_changes(command=outlined.command.model_copy(update={"ramp_s": own.ramp}))
+def record(own: Laboratory, effect: str, seed: int) -> Recorded | None:
+    """Recordings with an effect that moves the markers by `SIZE` deviations of the noise; None if no size does."""
+    rng, arm, commands = np.random.default_rng([seed, 2]), own.robot, own.commands(seed)
     settings: dict[str, Any] = {
         "priors": {"young_modulus": {}},
-        "simulator": {"time_step": 0.004},
-        "fixed": {"rayleigh_stiffness": own.damping},
+        "simulator": {"motion": "quasi-static", "refine": 4} if own.rests else {"time_step": 0.004},
+        "fixed": {} if own.rests else {"rayleigh_stiffness": own.damping},
     }
-    plain, base = rb.Model(arm, **settings), {"young_modulus": own.outline["young_modulus"]}
+    base, plain = {"young_modulus": own.outline["young_modulus"]}, rb.Model(arm, **settings)
+    still = rb.simulate(plain, commands, parameters=base, seed=seed)
 
-    def played(model: rb.Model, values: dict[str, float], noise: float) -> Sequence[rb.Trajectory]:
-        given = {"parameters": values, "noise": {"standard_deviation": noise}, "seed": seed}
-        return rb.simulate(model, own.walk, **given)
+    def recorded(runs: Sequence[rb.Trajectory], values: dict[str, float], size: float) -> Recorded:
+        keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(runs))]
+        errors = [jax.random.normal(key, run.position.shape) for key, run in zip(keys, runs, strict=True)]
+        seen = [run.position + own.noise * np.asarray(each) for run, each in zip(runs, errors, strict=True)]
+        return Recorded(runs, seen, values, size)
 
     if effect == NOTHING:
-        return Recorded(played(plain, base, own.noise), base, 0.0)
+        return recorded(still, base, 0.0)
     model = rb.Model(arm, mechanisms=[effect], **settings)
     priors = {n: p for n, p in model.parameters.prior.items() if p is not None and n not in plain.parameters.index}
-    signs = {name: float(rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.0)) for name in priors}
-    still, factor = played(plain, base, 1e-9), 1.0
+    signs, factor = {name: float(rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.0)) for name in priors}, 1.0
     for _ in range(TRIES):
         values = base | {name: drawn(prior, signs[name], factor) for name, prior in priors.items()}
         try:
-            moved = played(model, values, 1e-9)
+            moved = rb.simulate(model, commands, parameters=values, seed=seed)
         except rb.InputError:  # beyond what the arm bears
             factor *= 0.3
             continue
         change = np.concatenate([(a.position - b.position).ravel() for a, b in zip(moved, still, strict=True)])
         size = float(np.sqrt(np.mean(change**2))) / own.noise / SIZE
         if abs(size - 1.0) < NEAR:
-            return Recorded(played(model, values, own.noise), values, size)
+            return recorded(moved, values, size)
         factor = float(np.clip(factor * np.clip(1.0 / max(size, 1e-9), 0.1, 8.0), 1e-3, 8.0))
-    raise RuntimeError(f"seed {seed}: no size of {effect} moves the markers by {SIZE} deviations")
+    return None
 
 
 def drawn(prior: dict[str, Any], sign: float, factor: float) -> float:
@@ -188,7 +249,7 @@ def drawn(prior: dict[str, Any], sign: float, factor: float) -> float:
     return float(prior.get("loc", 0.0) + (abs(sign) if one_sided else sign) * factor * prior["scale"])
 
 
-def write_files(own: Laboratory, runs: Sequence[rb.Trajectory], seed: int, folder: Path) -> str:
+def write_files(own: Laboratory, recorded: Recorded, seed: int, folder: Path) -> str:
     """Write CSV files in a frame and units of the laboratory; the options of ``rfdropo init``."""
     rng = np.random.default_rng([seed, 3])
     turn = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)
@@ -196,13 +257,15 @@ def write_files(own: Laboratory, runs: Sequence[rb.Trajectory], seed: int, folde
     clamp, turns = rng.uniform(-500.0, 500.0, 3), 1.0 / (2.0 * np.pi * own.spool)
     scales = {"mm": 1e3, "deg": 360.0 * turns, "counts": 4096.0 * turns}
     folder.mkdir(parents=True)
-    for number, run in enumerate(runs, 1):
-        row = np.maximum(np.searchsorted(run.command_time, run.time + 1e-9) - 1, 0)
-        sent = (run.command[row] * scales[own.unit]).round(0 if own.unit == "counts" else 3)
-        frame = pd.DataFrame({"time": run.time.round(5)})
+    for number, (run, position) in enumerate(zip(recorded.runs, recorded.positions, strict=True), 1):
+        # A moving arm carries a command out after its row; a pose is what has come of it.
+        levels = np.vstack([run.initial_command, run.command])
+        row = np.searchsorted(run.command_time, run.time + (-1e-9 if own.rests else 1e-9))
+        sent = (levels[row] * scales[own.unit]).round(0 if own.unit == "counts" else 3)
+        frame = pd.DataFrame({} if own.rests else {"time": run.time.round(5)})
         for motor, column in enumerate(sent.T, 1):
             frame[f"motor{motor}_{own.unit}"] = column
-        seen = (1e3 * run.position @ turn.T + clamp).round(3)
+        seen = (1e3 * position @ turn.T + clamp).round(3)
         for marker, name in enumerate(own.outline["markers"]):
             frame[[f"{name}_{axis}" for axis in "xyz"]] = seen[:, marker]
         frame.to_csv(folder / f"rec{number:02d}.csv", index=False)
@@ -223,11 +286,13 @@ def write_files(own: Laboratory, runs: Sequence[rb.Trajectory], seed: int, folde
     return " ".join(f"--{name}={value}" for name, value in options.items())
 
 
-def audited(seed: int, effect: str, folder: Path) -> dict[str, Any]:
+def audited(seed: int, effect: str, rests: bool, folder: Path) -> dict[str, Any]:
     """Draw, record, type the README's commands; what was hidden and what was said."""
-    own = draw_laboratory(np.random.default_rng([seed, 1]))
+    own = draw_laboratory(np.random.default_rng([seed, 1]), rests)
     recorded = record(own, effect, seed)
-    options = write_files(own, recorded.runs, seed, folder / "data")
+    if recorded is None:
+        return {"hidden": effect, "verdict": UNREACHED, "sentence": "no size moves it enough"}
+    options = write_files(own, recorded, seed, folder / "data")
     steps = [typed(f'rfdropo init arm --recording "data/*.csv" {options} --defaults', folder)]
     robot = folder / "arm/arm.toml"
     text = robot.read_text(encoding="utf-8")
@@ -240,8 +305,14 @@ def audited(seed: int, effect: str, folder: Path) -> dict[str, Any]:
     steps += [typed(command, folder) for command in commands]
     audit = json.loads((folder / "runs/audit/audit.json").read_text(encoding="utf-8"))
     summary = json.loads((folder / "runs/arm/summary.json").read_text(encoding="utf-8"))
+    base = tomllib.loads((folder / "arm/experiment.toml").read_text(encoding="utf-8"))["model"]["mechanisms"]
+    first = next((finding["equivalence_class"] for finding in audit["findings"]), [])
+    silent = audit["verdict"] == "no_discrepancy"
     return {
         "hidden": effect,
+        "right": silent if effect in (NOTHING, *base) else effect in first,
+        "rests": rests,
+        "base": base,
         "share_of_size": round(recorded.size, 3),
         "truth": recorded.truth,
         "outline": own.outline,
@@ -289,28 +360,54 @@ def sizes_beside_truth(audit: dict[str, Any], own: Laboratory, effect: str, trut
     return rows
 
 
+def as_table(rows: Sequence[dict[str, Any]]) -> str:
+    """The ledger as a Markdown table."""
+    lines = [
+        "| seed | arm and files | hidden | named | right | 90 % interval of the size, truth | CPU s |",
+        "|---" * 7 + "|",
+    ]
+    for row in rows:
+        arm, walk = row["outline"], row["walk"]
+        rows_of = (
+            f"2 of {walk['poses']} poses" if row["rests"] else f"{len(walk['recordings'])} of {walk['duration']:.0f} s"
+        )
+        cables = f"{arm['segments']}x{arm['cables']} cables, {arm['gravity']}"
+        made = f"{1e3 * arm['length']:.0f} mm {arm['shape']}, {cables}, {rows_of} in {row['unit']}"
+        hidden = row["hidden"].replace("_", " ") + (" (in the base model)" if row["hidden"] in row["base"] else "")
+        found = "; ".join(", ".join(each) for each in row["classes"]).replace("_", " ")
+        sizes = [f"[{each['q05']:.3g}, {each['q95']:.3g}], {each['truth']:.3g}" for each in row["sizes"]]
+        cells = [row["seed"], made, hidden, f"`{row['verdict']}` {found}", "yes" if row["right"] else "no"]
+        lines.append("| " + " | ".join(map(str, [*cells, "; ".join(sizes), sum(row["processor_s"].values())])) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
-    """Run the seeds that the ledger does not have yet."""
+    """Run the seeds that the ledger does not have yet, and write its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("seeds", nargs="+", type=int, metavar="SEED")
-    parser.add_argument("--out", type=Path, default=Path("reports/strangers"))
+    parser.add_argument("--at-rest", action="store_true", help="poses without times instead of motion")
+    parser.add_argument("--out", type=Path, help="reports/strangers/motion or at_rest by default")
     parser.add_argument("--runs", type=Path, default=Path("runs/strangers"))
     given = parser.parse_args()
-    ledger = given.out / "ledger.jsonl"
+    kind = "at_rest" if given.at_rest else "motion"
+    out = given.out or Path("reports/strangers") / kind
+    ledger = out / "ledger.jsonl"
     ledger.parent.mkdir(parents=True, exist_ok=True)
     known = {line["seed"] for line in read_lines(ledger)}
     for seed in given.seeds:
         if seed not in known:
-            folder = given.runs / str(seed)
+            folder = given.runs / kind / str(seed)
             shutil.rmtree(folder, ignore_errors=True)
-            effect = EFFECTS[seed % len(EFFECTS)]
+            effect = HIDDEN[kind][seed % len(HIDDEN[kind])]
             try:
-                row = audited(seed, effect, folder)
+                row = audited(seed, effect, given.at_rest, folder)
             except subprocess.CalledProcessError as error:
                 said = f"failed: {shlex.join(error.cmd[3:])}"
-                row = {"hidden": effect, "verdict": "failed", "classes": [], "sizes": [], "sentence": said}
+                row = {"hidden": effect, "verdict": "failed", "right": False, "sentence": said}
             append_line(ledger, json.dumps({"seed": seed, **row}))
             print(f"{seed}: {row['hidden']} is hidden; {row['sentence']}", flush=True)
+    found = [line for line in read_lines(ledger) if "outline" in line]
+    (out / "table.md").write_text(as_table(found), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -92,14 +92,17 @@ def laws() -> dict[str, Mapping[str, Any]]:
     return {key: counted(sum(line[f"{key}_right"] for line in lines), len(lines)) for key in ("port", "law")}
 
 
-def strangers() -> dict[str, Mapping[str, Any]]:
-    """Share of drawn arms whose hidden cause is named first, and of those that hide none whose audit is silent."""
-    lines = read_lines(REPORTS / "strangers" / "ledger.jsonl")
-    hidden, clean = ([line for line in lines if (line["hidden"] == "nothing") == silent] for silent in (False, True))
-    return {
-        "named": counted(sum(line["hidden"] in (line["classes"] or [[]])[0] for line in hidden), len(hidden)),
-        "silent": counted(sum(line["verdict"] == "no_discrepancy" for line in clean), len(clean)),
+def strangers(kind: str) -> dict[str, Mapping[str, Any]]:
+    """Share of drawn arms whose hidden cause is named first, and of those that hide nothing new whose audit is
+    silent.
+    """
+    lines = [line for line in read_lines(REPORTS / "strangers" / kind / "ledger.jsonl") if "right" in line]
+    clean = [line["hidden"] in ("nothing", *line.get("base", [])) for line in lines]
+    counts = {
+        name: [line["right"] for line, silent in zip(lines, clean, strict=True) if silent == wanted]
+        for name, wanted in (("named", False), ("silent", True))
     }
+    return {name: counted(sum(rights), len(rights)) for name, rights in counts.items()}
 
 
 def sizes() -> Mapping[str, Any]:
@@ -158,7 +161,7 @@ def page() -> str:
         motion=audits("audit_power/unknown_scale/datasets.jsonl", "audit_power/visible_steps/datasets.jsonl"),
         today=audits("audit_power/visible_steps/datasets.jsonl", seeds=(5008, 5009)),
         laws=laws(),
-        strangers=strangers(),
+        strangers={kind: strangers(kind) for kind in ("motion", "at_rest")},
         sizes=sizes(),
         inferred=table1("rod"),
         trunk=json.loads((REPORTS / "sim2real_trunk" / "summary.json").read_text(encoding="utf-8")),
