@@ -15,9 +15,9 @@ EXPERIMENTS = Path(__file__).resolve().parents[2] / "experiments"
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["deepc_arm", "soromox_tentacle"])
 def test_a_strangers_robot_is_predicted_better_than_without_physics(name, datasets, tmp_path, monkeypatch):
-    """Within 1,500 rollouts, with draws enough for intervals."""
+    """Within 2,500 rollouts, with draws enough for intervals."""
     monkeypatch.setenv("RFDROPO_DATA", str(datasets))
-    words = ["calibrate", str(EXPERIMENTS / f"{name}.toml"), "--set", "inference.rollouts=1500"]
+    words = ["calibrate", str(EXPERIMENTS / f"{name}.toml"), "--set", "inference.rollouts=2500"]
     words += ["--set", "inference.draws=500", "--out", str(tmp_path / "fit")]
     monkeypatch.setattr(sys, "argv", ["rfdropo", *words])
     with pytest.raises(SystemExit) as stopped:
