@@ -90,7 +90,6 @@ SIZE = 3.0  # root mean square of what an effect moves the markers by, in deviat
 NEAR = 0.2  # relative tolerance of it
 TRIES = 8  # of the search for a size
 MINUTES = 15  # of an audit, at most
-UNREACHED = "unreached"  # verdict if no size of an effect reaches SIZE
 
 
 class Laboratory(NamedTuple):
@@ -291,7 +290,7 @@ def audited(seed: int, effect: str, rests: bool, folder: Path) -> dict[str, Any]
     own = draw_laboratory(np.random.default_rng([seed, 1]), rests)
     recorded = record(own, effect, seed)
     if recorded is None:
-        return {"hidden": effect, "verdict": UNREACHED, "sentence": "no size moves it enough"}
+        return {"hidden": effect, "verdict": "unreached", "sentence": "no size moves it enough"}
     options = write_files(own, recorded, seed, folder / "data")
     steps = [typed(f'rfdropo init arm --recording "data/*.csv" {options} --defaults', folder)]
     robot = folder / "arm/arm.toml"

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, Series
+from rfdropo_bayes.bayes.lanes import compiled_backend
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
 from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -53,8 +54,7 @@ class CalibrationProblem:
         """Method of Jacobians: differences of batches of rollouts on the compiled engine, whose derivative along a
         tangent is a difference as well, and takes 20 to 40 s to compile.
         """
-        backend = getattr(getattr(self.model.simulator, "engine", None), "backend", None)
-        return "central" if backend is not None and backend.name == "numba" else "auto"
+        return "auto" if compiled_backend(self.model.simulator) is None else "central"
 
     @property
     def measured(self) -> Measured:

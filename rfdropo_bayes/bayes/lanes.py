@@ -38,6 +38,12 @@ def _no_limit() -> None:
     """No check of the time."""
 
 
+def compiled_backend(simulator: Any) -> Any:
+    """The compiled backend of a simulator; None for JAX, and for a simulator without backends."""
+    backend = getattr(getattr(simulator, "engine", None), "backend", None)
+    return backend if backend is not None and backend.name == "numba" else None
+
+
 class Lanes:
     """A simulator behind compiled functions of lanes, each with its own parameters and commands.
 
@@ -63,13 +69,13 @@ class Lanes:
     ) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
-        backend = getattr(getattr(simulator, "engine", None), "backend", None)
+        backend = compiled_backend(simulator)
         self.width = WIDTH
         self.fields = tuple(fields)
         self.costly = tuple(costly)
         self._size: tuple[int, int] | None = None
         self.difference: float | None = None
-        if backend is not None and backend.name == "numba":
+        if backend is not None:
             self.difference = STEP if backend.precision == "float64" else COARSE
         self.physical = tuple(spec.name for spec in simulator.parameters) if physical is None else tuple(physical)
 

@@ -108,7 +108,7 @@ class CsvTable:
     Values may be separated by commas, semicolons, tabs, bars or spaces, and decimals may follow a comma (`dialect_of`).
     Lines that a program wrote above the names are left out (`table_lines`).
     A second line of units is no row: ``units`` maps the names of columns to their units.
-    Of an export of Vicon's the trajectories are read: ``rate`` is their rows a second, ``left_out`` the titles of the
+    The trajectories of an export of Vicon's are read: ``rate`` is their rows a second, ``left_out`` the titles of the
     other blocks (`marker_block`). Repeated lines of names are left out; ``notes`` tell their number.
 
     Args:

@@ -369,7 +369,7 @@ def _commands(table: pd.DataFrame, names: list[str], measured: list[str], *, any
     """Columns of commands. If no name matches: all columns in files of a user's own format, or the ``measured`` angles
     or forces of drives whose commands nobody recorded.
 
-    Of aims and other columns that are called commands, one kind is meant: the larger, the others if there are as many.
+    One kind is meant of aims and other columns that are called commands: the larger, the others if there are as many.
     Other columns that are called as the aims are read back.
     """
     sent = [name for name in names if SENT.search(AIMED.sub("", name))]

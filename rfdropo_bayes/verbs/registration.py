@@ -36,8 +36,9 @@ BENDS = tuple(np.geomspace(1.0 / 8.0, 8.0, 13))
 at half the assumed distance, and whose spool is a guess, bent 2.1 times as far."""
 
 REACHED = 1.5
-"""Factor of a bend that the priors of gains and spools reach, so that a calibration finds it from motion. Of 13 arms
-that move, whose cables lie where `init` assumes, a rod at rest of guessed stiffness had moved them by 1.33 in four."""
+"""Factor of a bend that the priors of gains and spools reach, so that a calibration finds it from motion. In five
+of eleven arms that move, whose cables lie where `init` assumes, a rod at rest of guessed stiffness put them elsewhere,
+by up to a factor of 1.33."""
 
 ENOUGH = 0.99  # share at or above which no exchange of channels is looked for
 LIKELY = 4  # exchanges that are looked at with all compliances

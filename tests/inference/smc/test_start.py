@@ -11,7 +11,7 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.inference import methods
 from rfdropo_bayes.inference.evaluations import Ledger
 from rfdropo_bayes.inference.modes import mode_search as laplace
-from rfdropo_bayes.inference.modes.optimisation import Laplace
+from rfdropo_bayes.inference.modes.optimisation import Laplace, optimisation_cost
 from rfdropo_bayes.inference.smc import sampler
 from rfdropo_bayes.inference.smc import start as starts
 from rfdropo_bayes.inference.smc.bridge import ModeMixture
@@ -130,7 +130,7 @@ def test_optimisations_expect_half_of_their_number_at_the_next_horizon():
     optimisations = laplace.begin(np.zeros((4, 3)), np.zeros(4), Ledger(), 0.0)
     config = laplace.LaplaceConfig(rollouts=1200.0, max_steps=10**6)
     steps = laplace._affordable_steps(40, config, optimisations, (10, 20, 40), 0)
-    assert steps == int(1200.0 / 3.0 / 4.0 * 4.0 / 13.0)
+    assert steps == int(1200.0 / 3.0 / 4.0 * 4.0 / optimisation_cost(3, 0)[1])
 
 
 @pytest.mark.slow
