@@ -74,4 +74,4 @@ def rod(elements: int = 20, time_step: float = 0.01) -> rb.BlackBox:
         "damping": table("1/s", 0.01, 2.0, 50.0),
     }
     names = {"markers": ["tip"], "channels": ["force"], "command_unit": "N"}
-    return rb.BlackBox(simulate, parameters=parameters, time_step=time_step, name="rod", difference=1e-3, **names)
+    return rb.BlackBox(simulate, parameters=parameters, time_step=time_step, name="rod", **names)

@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Shaped
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks, is_batch, padded
 from rfdropo_bayes.bayes.channels import Channel, Series
-from rfdropo_bayes.bayes.lanes import compiled_backend
 from rfdropo_bayes.bayes.trajectory_model import Measured, TrajectoryModel
 from rfdropo_bayes.posteriors import DrawsByOwner
 from rfdropo_bayes.simulators.protocol import Observation, Result
@@ -48,13 +47,6 @@ class CalibrationProblem:
     def names(self) -> tuple[str, ...]:
         """Labels of the inferred parameters, in sampling order."""
         return self.model.scopes.names
-
-    @property
-    def jacobian(self) -> str:
-        """Method of Jacobians: differences of batches of rollouts on the compiled engine, whose derivative along a
-        tangent is a difference as well, and takes 20 to 40 s to compile.
-        """
-        return "auto" if compiled_backend(self.model.simulator) is None else "central"
 
     @property
     def measured(self) -> Measured:

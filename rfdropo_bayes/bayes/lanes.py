@@ -1,4 +1,4 @@
-"""A simulator behind compiled programs: rollouts and their derivatives, lane by lane, in batches of few sizes."""
+"""A simulator behind compiled programs: rollouts lane by lane, in batches of few sizes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rfdropo_bayes.simulators.protocol import Simulator
 # Lanes of one call of an audit: a compilation costs more than the padding of a call, so that there is one size. Calls
 # with few different lanes are the most frequent.
 WIDTH = 8 * max(available_processors(), 2)
-# Step of a derivative of a compiled engine to one side, in prior deviations; a larger step is taken to both sides. A
+# Step of a derivative to one side, in prior deviations; a larger step is taken to both sides. A
 # delay of .07 s is known to 4e-5 s, and a fit with steps of 1e-2 (a millisecond) ends 1.5e-4 s beside it. Rounding of
 # 1e-13 m errs by 1e-9 m a deviation, the last iteration of an equilibrium by 1e-6 m.
 STEP = 1e-4
@@ -38,12 +38,6 @@ def _no_limit() -> None:
     """No check of the time."""
 
 
-def compiled_backend(simulator: Any) -> Any:
-    """The compiled backend of a simulator; None for JAX, and for a simulator without backends."""
-    backend = getattr(getattr(simulator, "engine", None), "backend", None)
-    return backend if backend is not None and backend.name == "numba" else None
-
-
 class Lanes:
     """A simulator behind compiled functions of lanes, each with its own parameters and commands.
 
@@ -56,7 +50,7 @@ class Lanes:
         physical: parameters that lanes are given; all of the simulator's by default. The others are nominal.
 
     Attributes:
-        difference: step of derivatives in prior deviations, see `STEP`; None if derivatives are exact.
+        difference: step of derivatives in prior deviations, see `STEP`.
     """
 
     def __init__(
@@ -69,14 +63,11 @@ class Lanes:
     ) -> None:
         self.simulator = simulator
         self.marker_index = marker_index
-        backend = compiled_backend(simulator)
         self.width = WIDTH
         self.fields = tuple(fields)
         self.costly = tuple(costly)
         self._size: tuple[int, int] | None = None
-        self.difference: float | None = None
-        if backend is not None:
-            self.difference = STEP if backend.precision == "float64" else COARSE
+        self.difference = COARSE if simulator.description.get("precision") == "float32" else STEP
         self.physical = tuple(spec.name for spec in simulator.parameters) if physical is None else tuple(physical)
 
     def _observe(
@@ -101,8 +92,6 @@ class Lanes:
     @property
     def slope_rollouts(self) -> int:
         """Rollouts per derivative, beside those of the value."""
-        if self.difference is None:
-            return 3
         return 1 if self.difference <= STEP else 2
 
     @property
@@ -119,17 +108,6 @@ class Lanes:
     @cached_property
     def _rolled(self) -> Any:
         return jax.jit(jax.vmap(self._observe, in_axes=(0, 0, 0, None)))
-
-    @cached_property
-    def _derived(self) -> Any:
-        def one(theta: jax.Array, tangent: jax.Array, start: jax.Array, commands: Commands) -> dict[str, jax.Array]:
-            def data(theta: jax.Array) -> dict[str, jax.Array]:
-                parts, _ = self._observe(theta, start, commands, jnp.asarray(commands.step.shape[0]))
-                return {name: parts[name] for name in self.fields}
-
-            return jax.jvp(data, (theta,), (tangent,))[1]
-
-        return jax.jit(jax.vmap(one))
 
     def roll(
         self,
@@ -165,18 +143,6 @@ class Lanes:
             "sample_fraction": np.pad(commands.sample_fraction, [(0, 0), (0, rows)]),
         }
         return commands._replace(**longer)
-
-    def differentiate(
-        self,
-        theta: Thetas,
-        tangent: Thetas,
-        start: np.ndarray,
-        commands: Commands,
-        check: Callable[[], None] = _no_limit,
-    ) -> Fields:
-        """Derivatives along tangents of the parts of an observation that are data."""
-        lanes = (theta, tangent, start, commands)
-        return in_chunks(lambda own: self._derived(*own), lanes, (self.width,), before=check)
 
 
 def lanes_of(simulator: Simulator, marker_index: np.ndarray, physical: tuple[str, ...]) -> Lanes:

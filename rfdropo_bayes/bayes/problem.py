@@ -106,7 +106,6 @@ class ResidualProblem(Problem, Protocol):
     Attributes:
         physical_names: parameters that the simulation depends on; the others are noise. All of ``names`` if unknown:
         noise parameters are then identified numerically.
-        jacobian: method of Jacobians: "forward", "central", or "auto".
         prior_derivatives: derivatives of the log prior.
     """
 
@@ -114,16 +113,13 @@ class ResidualProblem(Problem, Protocol):
     def physical_names(self) -> tuple[str, ...]: ...
 
     @property
-    def jacobian(self) -> str: ...
-
-    @property
     def prior_derivatives(self) -> Derivatives: ...
 
     def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Any, " m"]:
         """Whitened residuals r of the first ``horizon`` rows for ONE set of values.
 
-        ``-0.5 * sum(r**2) + c`` is the log likelihood, with ``c`` a function of noise parameters only. Traceable by JAX
-        if the simulator is; otherwise Jacobians are taken by central differences.
+        ``-0.5 * sum(r**2) + c`` is the log likelihood, with ``c`` a function of noise parameters only. Residuals that
+        JAX can trace are computed for many points at once.
         """
         ...
 
@@ -218,7 +214,6 @@ class ProblemDefaults:
 
     fingerprint: str = ""
     status_names: Mapping[int, str] = MappingProxyType({})
-    jacobian: str = "auto"
 
     @cached_property
     def prior_ends(self: Any) -> Mapping[str, tuple[float, float]]:

@@ -31,10 +31,10 @@ from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.journal import Arrays, Journal, digest
 from rfdropo_bayes.discrepancy.measurements import Measurements
 from rfdropo_bayes.discrepancy.score import VISIBLE
+from rfdropo_bayes.discrepancy.usable_difference import usable_difference
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig, find_modes
 from rfdropo_bayes.inference.modes.optimisation import maximise, normal_at, optimisation_cost
 from rfdropo_bayes.inference.modes.targets import Target as Climbed
-from rfdropo_bayes.simulators.finite_differences import usable_difference
 from rfdropo_bayes.simulators.protocol import Observation
 
 ALL = 40  # most steps of a full optimisation
@@ -277,7 +277,6 @@ class Posterior(ProblemDefaults):
     target: FitTarget  # target of the fit
     start: Float[np.ndarray, " d"]  # all coordinates
     free: Int[np.ndarray, " free"]  # indices of free coordinates
-    jacobian: str = "central"
 
     @property
     def _coordinates(self) -> Coordinates:
@@ -552,8 +551,6 @@ def with_usable_differences(target: FitTarget, x: Float[np.ndarray, " d"]) -> Fi
     which steps agree.
     """
     usual, coordinates = target.forward.lanes.difference, target.forward.coordinates
-    if usual is None:
-        return target
     directions = np.diag(coordinates.prior_sd)[: coordinates.base]
 
     def slope(step: float) -> np.ndarray:

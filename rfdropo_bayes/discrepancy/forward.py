@@ -158,32 +158,8 @@ class Forward:
         at null.
         """
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
-        step = self._difference
-        derivatives = self._exact(points, tangent) if step is None else self._differences(points, directions, step)
+        derivatives = self._differences(points, directions, self.lanes.difference)
         return derivatives | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
-
-    @property
-    def _difference(self) -> float | None:
-        """See `Lanes.difference`."""
-        return self.lanes.difference
-
-    def _exact(self, points: Points, tangent: np.ndarray) -> Fields:
-        """Derivatives by JAX."""
-        flat, start, commands = self._per_lane(self.coordinates.physical_values(points, self.slots), points)
-        along = tangent.reshape(flat.shape)
-        # Recordings that a direction does not affect, such as another group's, are unchanged.
-        moved = np.flatnonzero(along.any(axis=1))
-        moved = moved if len(moved) else np.arange(1)
-        derivatives = self.lanes.differentiate(
-            flat[moved], along[moved], start[moved], commands.of(moved), self.deadline.check
-        )
-        self.rollouts += self.lanes.slope_rollouts * len(moved)
-        shown = {}
-        for name, part in derivatives.items():
-            every = np.zeros((len(flat), *part.shape[1:]))
-            every[moved] = np.nan_to_num(part)
-            shown[name] = every.reshape(len(points), self.count, *part.shape[1:])
-        return shown
 
     def _differences(self, points: Points, directions: Points, step: float) -> Fields:
         """Differences over a step in prior deviations: to one side if it is small, and at bounds; zero if a rollout

@@ -265,7 +265,7 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
             yield results
     target, base = results.reached.settled()
     problem, step = begun.problem, target.forward.lanes.difference
-    if step is not None and step != problem.lanes.difference:  # steps that the base fit has found usable
+    if step != problem.lanes.difference:  # steps that the base fit has found usable
         finer = problem.finer and (problem.finer[0].with_difference(step), problem.finer[1])
         problem = replace(problem, lanes=target.forward.lanes, finer=finer)
     results = replace(results, problem=problem).after(BASE)

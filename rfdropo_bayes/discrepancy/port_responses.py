@@ -151,8 +151,7 @@ def _response(
 
     def compute() -> dict[str, np.ndarray]:
         forward, count = target.forward, len(signals)
-        usual = forward.lanes.difference
-        step = port.size * (SHARE if usual is None or usual <= STEP else COARSE)
+        step = port.size * (SHARE if forward.lanes.difference <= STEP else COARSE)
         lane = np.tile(np.arange(forward.count), count)
         w = np.moveaxis(step * signals.reshape(-1, *signals.shape[2:]), 1, 0)
         acting = list(zip(ports.members(port), w, strict=True))

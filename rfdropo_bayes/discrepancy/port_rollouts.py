@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.bayes.batches import chunk_sizes, in_chunks
-from rfdropo_bayes.bayes.lanes import STEP, Fields, Lanes
+from rfdropo_bayes.bayes.lanes import Fields, Lanes
 from rfdropo_bayes.bayes.scopes import build_scopes
 from rfdropo_bayes.discrepancy.forward import Forward, Points
 from rfdropo_bayes.discrepancy.journal import digest
@@ -233,11 +233,6 @@ class PortedForward(Forward):
     def with_difference(self, step: float) -> Forward:
         """See `Forward.with_difference`."""
         return self.instead_of(self.plain.with_difference(step), self.table)
-
-    @property
-    def _difference(self) -> float:
-        """See `Lanes.difference`; JAX does not see the signals."""
-        return self.lanes.difference or STEP
 
     @property
     def _own(self) -> list[str]:

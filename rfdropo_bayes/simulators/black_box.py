@@ -23,15 +23,13 @@ from rfdropo_bayes.simulators.callbacks import one_callback
 from rfdropo_bayes.simulators.commands import Commands, commands_on_grid, observed_at, sample
 from rfdropo_bayes.simulators.control_session import Session
 from rfdropo_bayes.simulators.extended import ExtendedSimulator, Wound
-from rfdropo_bayes.simulators.finite_differences import LENGTH, with_differences
 from rfdropo_bayes.simulators.mechanisms import BLACK_BOX, Mechanism, Values, check_mechanisms, code_of, obstacle
 from rfdropo_bayes.simulators.parameters import ParameterSpec, specs_of
 from rfdropo_bayes.simulators.protocol import Observation, Result
 from rfdropo_bayes.tables import nearest, parse_table
 
-STROKES = {"m": LENGTH, "rad": 0.1, "N": 1.0, "N m": 1.0, "Pa": 1e4, "-": 1.0}
-"""Units of commands, and the size that perturbations of a command are relative to."""
-SMALLEST_SHARE = 1e-3  # of its range: least size that perturbations of a parameter are relative to
+COMMAND_UNITS = ("m", "rad", "N", "N m", "Pa", "-")
+APART = 0.005  # [m] between neighbours of markers whose undeformed positions are unknown
 PROBED_ROWS = 3
 ACTION = 0.05
 """Default change of a command by one action of a policy, as a share of the range of commands. Twenty actions cross the
@@ -52,7 +50,7 @@ class BlackBox:
     in place of the function is a command line; `ProcessSimulation` has its protocol.
 
     A rollout that raises, or returns a number that is not finite, counts as diverged. The same arguments must give the
-    same answer. Derivatives are central differences.
+    same answer.
 
     Args:
         function: function that simulates.
@@ -67,7 +65,6 @@ class BlackBox:
         lanes: number of parameter sets per call.
         one_shape: whether a batched function always gets arrays of the same shape: ``lanes`` sets, padded by repeats,
             and whole commands. JAX then compiles it once for recordings of equal length.
-        difference: relative step of derivatives; larger if the motion is rough on small scales.
         usual_command: size of usual commands, in their unit; by default a usual trunk's.
         limits: least and greatest command of each channel for policies; none by default.
         families: parameters that are not inferred unless they have a prior, each with the quantity of which it is a
@@ -88,7 +85,6 @@ class BlackBox:
     batched: bool = False
     lanes: int = 64
     one_shape: bool = False
-    difference: float | None = None
     usual_command: float | None = None
     families: Mapping[str, str] = field(default_factory=dict)
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -99,8 +95,8 @@ class BlackBox:
         if self.one_shape and not self.batched:
             remedy = "give batched=True, and a function of many parameter sets"
             raise InputError("one_shape needs batched = true", where=self.name, remedy=remedy)
-        if self.command_unit not in STROKES:
-            remedy = nearest(self.command_unit, STROKES)
+        if self.command_unit not in COMMAND_UNITS:
+            remedy = nearest(self.command_unit, COMMAND_UNITS)
             raise InputError(f"unknown command_unit {self.command_unit!r}", where=self.name, remedy=remedy)
         for name, ends in self.limits.items():
             if name not in self.channels:
@@ -310,7 +306,7 @@ class BlackBoxSimulator(ExtendedSimulator):
 
     def marker_points(self) -> Float[np.ndarray, "marker 3"]:
         """Places in sequence along z: the marker positions of an undeformed black box are unknown."""
-        return np.arange(1.0, len(self.marker_names) + 1.0)[:, None] * np.array([0.0, 0.0, LENGTH])
+        return np.arange(1.0, len(self.marker_names) + 1.0)[:, None] * np.array([0.0, 0.0, APART])
 
     def commands(
         self,
@@ -371,7 +367,7 @@ class BlackBoxSimulator(ExtendedSimulator):
         initial, reached = self.actuated(values, commands, self.time_step)
         command = jnp.concatenate([initial[None], reached]).astype(jnp.float64)
         limit = jnp.asarray(len(command) - 1 if steps is None else steps, jnp.float64)
-        moved = self._differentiable((own, command), limit)
+        moved = self._call((own, command), limit)
         true, at = sample(moved.position, commands), observed_at(commands, self.time_step)
         position = self.measured(values, true, at, self.meanwhile(values, commands))
         status = jnp.where(moved.failed, int(Result.DIVERGED), int(Result.OK))
@@ -398,20 +394,6 @@ class BlackBoxSimulator(ExtendedSimulator):
     def session(self, lanes: int, period: float) -> Session:
         """A session of ``lanes`` lanes, commanded once per control ``period`` [s]; see `Session`."""
         return Session(self, lanes, period)
-
-    @cached_property
-    def _differentiable(self) -> Any:
-        sizes = {
-            spec.name: SMALLEST_SHARE * (spec.high - spec.low) if np.isfinite(spec.high - spec.low) else 1e-12
-            for spec in self.box.specs
-        }
-        stroke = self.box.usual_command or STROKES[self.command_unit]
-
-        def size(inputs: tuple[dict[str, Array], Array]) -> tuple[dict[str, Array], Array]:
-            own, command = inputs
-            return {name: jnp.abs(v) + sizes[name] for name, v in own.items()}, jnp.full_like(command, stroke)
-
-        return with_differences(self._call, size, "float64", difference=self.box.difference)
 
     def _call(self, inputs: tuple[dict[str, Array], Array], limit: Array) -> Moved:
         rows = inputs[1].shape[0]

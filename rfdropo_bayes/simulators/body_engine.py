@@ -1,8 +1,8 @@
 """Engines for the motion of a body, and of a cube that it pushes: a rod in JAX or compiled by Numba, a mesh by Numba.
 
 For a rod both engines give the same numbers. JAX is differentiable and runs on any device; Numba uses vector lanes and
-threads of a CPU, in one callback for a whole batch, with derivatives by differences. A rod may
-also be at rest in every row: an equilibrium found from the row before, without time or damping.
+threads of a CPU, in one callback for a whole batch, which JAX cannot differentiate. A rod may also be at rest in every
+row: an equilibrium found from the row before, without time or damping.
 """
 
 from __future__ import annotations
@@ -17,18 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.fem import (
-    BendingLaw,
-    BodyEffects,
-    Material,
-    PointMap,
-    Viscoelasticity,
-    Wall,
-    point_positions,
-    prepare,
-    simulate,
-    state_at_rest,
-)
+from rfdropo_bayes.fem import Material, PointMap, point_positions, prepare, simulate, state_at_rest
 from rfdropo_bayes.fem import static_equilibrium as find_equilibrium
 from rfdropo_bayes.fem.dynamics import Prepared, State, System
 from rfdropo_bayes.fem.integrators import STAGES, Integrator
@@ -41,40 +30,13 @@ from rfdropo_bayes.fem.rollouts import Motion
 from rfdropo_bayes.fem.section_loads import SectionLoads, loaded
 from rfdropo_bayes.fem.tetrahedra import TetrahedralMaterial, TetrahedralSystem
 from rfdropo_bayes.simulators.callbacks import one_callback
-from rfdropo_bayes.simulators.finite_differences import (
-    ACCELERATION,
-    LENGTH,
-    MASS,
-    MASS_DAMPING,
-    STIFFNESS_DAMPING,
-    incompressibility_margin,
-    with_differences,
-)
 from rfdropo_bayes.simulators.port_signals import BodySignals
 
-EFFECT_SIZES = BodyEffects(
-    bending=BendingLaw(fibre=0.2, anisotropy=0.2, cross_plane=0.1, twist_x=0.1, twist_y=0.1),
-    viscoelasticity=Viscoelasticity(0.3, 0.3),
-    softening_rate=0.01,
-    drag=100.0,
-    wall=Wall(1e3, 0.01, 0.1),
-    cable_compliance=1e-4,
-    coulomb_friction=0.05,
-    capstan_friction=0.1,
-)
-"""Sizes of effects, whose null values are zero; units as in ``BodyEffects``."""
 QUASI_STATIC: Literal["quasi-static"] = "quasi-static"  # motion of a body that is at rest in every row
-FAR_WOUND = 10.0
-"""[m] Beyond the displacement of any cable: a drive that goes farther winds a soft spring, or is a pressure."""
-CUBE_SIZES = np.repeat([LENGTH, 0.1, 0.1, 1.0], [3, 4, 3, 3])
-"""Sizes of a cube's centre [m], quaternion, velocity [m/s] and spin [rad/s]."""
-FRICTION = 0.1  # size of a coefficient of friction
 LOAD_PLACES = (0.3, 0.65, 1.0)
 """Shares of a body's length at which forces may act: more places are not distinguishable, as forces at neighbouring
 places move the markers similarly (cosine .95 at .06 and .2 m of an arm of .2 m).
 """
-BODY_SIGNALS = BodySignals(np.float64(0.1), np.float64(0.1), np.float64(0.1), np.float64(ACCELERATION))  # type: ignore[arg-type]
-"""Sizes of signals that act on a body [N, -, -, m/s2]."""
 
 
 class EngineBody(Protocol):
@@ -201,8 +163,6 @@ class Engine:
         """Roll out from the initial state; ``steps`` limits the steps computed; later rows are meaningless. At rest a
         step is an equilibrium.
 
-        Derivatives of the compiled backend are differences along each tangent.
-
         Raises:
             InputError: a cube without a scene, or a scene without a cube; loads on another body than a rod alone.
         """
@@ -218,7 +178,7 @@ class Engine:
         if self.backend.name == "jax":
             return self._reference(inputs, steps)
         limit = jnp.asarray(drive.shape[0] if steps is None else steps, jnp.float64)
-        return self._differentiable(inputs, limit)
+        return self._call(inputs, limit)
 
     def section_loads(self, loads: BodySignals | None) -> SectionLoads | None:
         """Signals on the body as the engine takes them, with the stations that forces act on; None without signals."""
@@ -274,10 +234,6 @@ class Engine:
         kind = np.dtype(backend.precision).type
         return TetrahedralEngine(system.body, system.cables, system.limits, self.body.markers, dtype=kind, **options)
 
-    @cached_property
-    def _differentiable(self) -> Any:
-        return with_differences(self._call, input_sizes, self.backend.precision)
-
     def _call(self, inputs: Inputs, limit: Array) -> Motion:
         system, rows = self.body.system, inputs.drive.shape[0] + 1
         cables = len(system.cables.anchor) if isinstance(system, System) else inputs.drive.shape[1]
@@ -308,34 +264,3 @@ def cube_arrays(cube: CubeInputs) -> tuple[Float[np.ndarray, "batch 13"], Float[
     solid = cube.cube
     values = np.stack([solid.mass, solid.side, solid.gyration_radius, solid.friction], axis=-1)
     return np.concatenate([*cube.start], axis=-1), values
-
-
-def input_sizes(inputs: Inputs) -> Inputs:
-    """Sizes that perturbations of the inputs are relative to."""
-    material, start, drive, cube, loads = inputs
-    changes: dict[str, Any] = {
-        "gravity": jnp.full_like(material.gravity, ACCELERATION),
-        "rayleigh_mass": jnp.abs(material.rayleigh_mass) + MASS_DAMPING,
-        "rayleigh_stiffness": jnp.abs(material.rayleigh_stiffness) + STIFFNESS_DAMPING,
-    }
-    if isinstance(material, Material):
-        effects = [
-            None if value is None else jax.tree.map(jnp.asarray, size)
-            for value, size in zip(material.effects, EFFECT_SIZES, strict=True)
-        ]
-        changes |= {
-            "poisson_ratio": incompressibility_margin(material.poisson_ratio),
-            "point_mass": jnp.full_like(material.point_mass, MASS),
-            "effects": BodyEffects(*effects),
-        }
-    magnitudes = jax.tree.map(lambda value: jnp.abs(value) + 1e-12, material)._replace(**changes)
-    if cube is not None:
-        solid = jax.tree.map(lambda value: jnp.abs(value) + 1e-12, cube.cube)
-        widths = np.split(CUBE_SIZES, np.cumsum([3, 4, 3]))
-        place = CubeState(*(jnp.broadcast_to(size, v.shape) for size, v in zip(widths, cube.start, strict=True)))
-        cube = CubeInputs(solid._replace(friction=jnp.abs(cube.cube.friction) + FRICTION), place)
-    if loads is not None:
-        loads = jax.tree.map(lambda part, size: jnp.full_like(part, size), loads, BODY_SIGNALS)
-    largest = jnp.maximum(jnp.abs(start), jnp.max(jnp.abs(drive), axis=0, initial=0.0))
-    size = jnp.where(largest > FAR_WOUND, largest, LENGTH)
-    return Inputs(magnitudes, size, jnp.broadcast_to(size, drive.shape), cube, loads)

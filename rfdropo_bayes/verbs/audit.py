@@ -396,7 +396,8 @@ def _lanes(
         added = whole.mechanisms[len(spec.mechanisms) :]
         kept = [name for name, m in zip(names, added, strict=True) if m.name not in slow]
         null = coordinates.nominal | coordinates.named(coordinates.null)
-        for fewer in [kept, []] if lanes.difference is not None else []:
+        compiled = isinstance(whole, TrunkSimulator) and whole.engine.backend.name == "numba"
+        for fewer in [kept, []] if compiled else []:
             if len(fewer) < len(names):
                 fast = build_simulator(spec.with_mechanisms(*fewer))
                 lanes = RoutedLanes(Lanes(fast, markers, fields=fields), lanes, null)

@@ -187,9 +187,7 @@ def preflight(model: Model, runs: Sequence[Trajectory], *, seed: int = 0, share:
     start = np.asarray(jax.random.permutation(second, PRIOR_DRAWS))[:count]
     noise = _noise(model, problem, drawn, runs)
     noise = noise._replace(white=float(np.sqrt(share)) * noise.white)  # fewer rows know as much
-    rough = isinstance(model.robot, BlackBox) and model.robot.difference
-    difference = rough or 0.0
-    slopes, good, per_set, observed = _slopes(problem, coordinates, drawn, start, difference)
+    slopes, good, per_set, observed = _slopes(problem, coordinates, drawn, start)
     per_set /= share
     if not good.any():
         raise InputError("no draw of the prior can be simulated", where="check", remedy=observed.remedy)
@@ -275,24 +273,16 @@ class _Slopes(NamedTuple):
 
 
 def _slopes(
-    problem: CalibrationProblem,
-    coordinates: _Coordinates,
-    drawn: Mapping[str, np.ndarray],
-    start: np.ndarray,
-    difference: float,
+    problem: CalibrationProblem, coordinates: _Coordinates, drawn: Mapping[str, np.ndarray], start: np.ndarray
 ) -> tuple[_Slopes, np.ndarray, float, Result]:
-    """Derivatives at draws of the prior, which draws succeeded, seconds of a parameter set, and the worst result.
-
-    Steps are at least the relative ``difference`` that a rough simulator asks for.
-    """
+    """Derivatives at draws of the prior, which draws succeeded, seconds of a parameter set, and the worst result."""
     dimension, count = len(coordinates.names), len(start)
     rows = [
         np.log(drawn[n][start]) if log else drawn[n][start]
         for n, log in zip(coordinates.names, coordinates.logarithmic, strict=True)
     ]
     x = (np.stack(rows, axis=1) - coordinates.mean) / coordinates.sd
-    size = np.maximum(STEP, np.where(coordinates.logarithmic, difference / coordinates.sd, difference))
-    steps = np.concatenate([np.diag(size), -np.diag(size)])
+    steps = STEP * np.concatenate([np.eye(dimension), -np.eye(dimension)])
     moved = (x[:, None] + steps).reshape(-1, dimension)
     values = coordinates.values(moved)
     for name, own in values.items():
@@ -308,7 +298,7 @@ def _slopes(
 
     def slope(part: Any) -> np.ndarray:
         both = np.asarray(part).reshape(count, 2, dimension, *part.shape[1:])
-        return (both[:, 0] - both[:, 1]) / (2.0 * size.reshape(-1, *[1] * (part.ndim - 1)))
+        return (both[:, 0] - both[:, 1]) / (2.0 * STEP)
 
     level = np.asarray(seen.tension).reshape(count, 2 * dimension, *seen.tension.shape[1:])[:, 0]
     return _Slopes(slope(seen.position), slope(seen.tension), level), ended, per_set, Result(int(status.max()))

@@ -38,7 +38,7 @@ def alone(problem, *further):
         (alone(LinearGaussian()), r"Bare lacks fingerprint, prior_ends, status_names; .*define the members of Problem"),
         (
             alone(LinearGaussian(), "fingerprint", "prior_ends", "status_names", "residuals"),
-            r"Bare has 'residuals' but lacks jacobian, physical_names, prior_derivatives; .*ResidualProblem",
+            r"Bare has 'residuals' but lacks physical_names, prior_derivatives; .*ResidualProblem",
         ),
         (
             alone(Spring(), "fingerprint", "prior_ends", "status_names", "rollouts", "physical_names", "observed"),

@@ -129,21 +129,6 @@ def test_what_jax_compiles_is_compiled_once_for_all_batches_of_whole_recordings(
         BlackBox(lag, parameters=PARAMETERS, one_shape=True, **NAMES)
 
 
-def test_derivatives_are_those_of_the_formula():
-    simulator = BlackBoxSimulator(BlackBox(lag, parameters=PARAMETERS, **NAMES))
-    level = np.full(30, 0.02)
-    time = STEP * np.arange(31)
-    commands = simulator.commands(time[:-1], level[:, None], np.zeros(1), time)
-
-    def tip(constant):
-        return simulator.rollout(VALUES | {"time_constant": constant}, commands).position[:, 0, 0]
-
-    slope = jax.jvp(tip, (jnp.asarray(0.25),), (jnp.ones(()),))[1]
-    elapsed = STEP * np.arange(31)
-    wanted = -1.4 * 0.02 * np.exp(-elapsed / 0.25) * elapsed / 0.25**2
-    np.testing.assert_allclose(slope, wanted, atol=1e-7)
-
-
 def test_mechanisms_act_before_and_after_it_and_not_inside(sent):
     box = BlackBox(lag, parameters=PARAMETERS, **NAMES)
     extended = BlackBoxSimulator(box, mechanisms_named(["command_gain", "camera_offset"], box))

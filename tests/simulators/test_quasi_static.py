@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -137,14 +136,3 @@ def test_a_session_rests_where_rollouts_do():
     for lane, young in enumerate((1e6, 2e6)):
         found = rows(simulator, [0.0, 0.004], values={"young_modulus": young})
         np.testing.assert_allclose(seen.position[lane], found.position[-1], atol=1e-7)
-
-
-def test_a_derivative_is_the_difference_of_rollouts():
-    simulator, time = simulated(LINE), np.arange(2.0)
-    given = simulator.commands(time, np.array([[0.0], [0.005]]), np.zeros(1), time)
-
-    def tip(logarithm):
-        return simulator.rollout({"young_modulus": 1e6 * jnp.exp(logarithm)}, given).position[-1, 0]
-
-    slope = jax.jvp(tip, (jnp.zeros(()),), (jnp.ones(()),))[1]
-    np.testing.assert_allclose(slope, (tip(0.01) - tip(-0.01)) / 0.02, rtol=2e-3, atol=1e-6)

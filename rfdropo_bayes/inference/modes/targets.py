@@ -27,9 +27,9 @@ from rfdropo_bayes.bayes.problem import BatchedResiduals, ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.optimisation import positive_part
 
-# Steps of central differences, in the prior's deviations of each unconstrained coordinate, which may be metres.
-DIFFERENCE = 1e-4
-BATCH_DIFFERENCE = 1e-3  # of rollouts in batches, which may be in single precision
+# Step of central differences, in the prior's deviations of each unconstrained coordinate, which may be metres; rollouts
+# may be in single precision.
+DIFFERENCE = 1e-3
 PRIOR_DRAWS = 200  # for these deviations
 NOISE_DIFFERENCE = 1e-4  # of noise coordinates, which are logarithms
 
@@ -47,8 +47,8 @@ class Target(NamedTuple):
     linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # residuals (m,) and their Jacobian (m, d)
     residuals: Callable[[np.ndarray], np.ndarray]  # residuals (n, m) of a batch (n, d); zero for missing data
     noise: Bool[np.ndarray, " d"]  # coordinates along which the log determinant changes
-    # residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if derivatives are
-    # not recomputed
+    # residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if the Jacobian is
+    # exact
     differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
     # gradient of the terms of the log likelihood beside half the sum of squares, whose curvature is neglected; None if
     # these terms depend on noise coordinates only
@@ -107,7 +107,7 @@ def make_target(
     Args:
         problem: problem with residuals.
         horizon: rows to use.
-        ledger: charged with every rollout; a Jacobian in d directions counts as d + 1.
+        ledger: charged with every rollout; a Jacobian in d directions takes 2 d + 1.
         u: a point with a finite likelihood, at which noise coordinates are identified.
         prior: `prior_derivatives`.
         noise: noise coordinates, if known.
@@ -143,21 +143,18 @@ def prior_derivatives(problem: ResidualProblem) -> tuple[Callable, Callable]:
 
 def _make_linearise(
     problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray
-) -> tuple[Callable, Callable, Callable | None]:
+) -> tuple[Callable, Callable, Callable]:
     """Three functions: residuals of a batch of points, without a charge to the budget; residuals and Jacobian at one
-    point, with a charge; and `Target.differences`."""
+    point, with a charge, by central differences; and `Target.differences`."""
 
     def residuals(u: Array) -> Any:
         values = problem.from_unconstrained(u[None])
         return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
 
-    jacobian = problem.jacobian
-    in_batches = problem.residual_batch if jacobian == "central" and isinstance(problem, BatchedResiduals) else None
+    in_batches = problem.residual_batch if isinstance(problem, BatchedResiduals) else None
     drawn = problem.to_unconstrained(problem.sample_prior(jax.random.key(0), PRIOR_DRAWS))
-    width = (BATCH_DIFFERENCE if in_batches else DIFFERENCE) * np.asarray(drawn).std(axis=0)
-    batched = None
-    if in_batches is None and _works(lambda f, u: f(u), residuals, u):
-        batched = jax.jit(jax.vmap(residuals))
+    width = DIFFERENCE * np.asarray(drawn).std(axis=0)
+    batched = jax.jit(jax.vmap(residuals)) if in_batches is None and _traceable(residuals, u) else None
 
     def at(points: np.ndarray) -> np.ndarray:
         if in_batches:
@@ -176,29 +173,13 @@ def _make_linearise(
         residual, changes = differences(u, np.diag(width))
         return residual, changes / width
 
-    @jax.jit
-    def both(u: Array) -> tuple[Array, Array]:
-        return jax.vmap(lambda e: _directional(residuals, u, e), out_axes=(None, 1))(jnp.eye(len(u)))
-
-    def forward(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        ledger.charge(problem, len(u) + 1, horizon)
-        value, columns = both(jnp.asarray(u))
-        return np.asarray(value), np.asarray(columns)
-
-    if jacobian == "auto":
-        jacobian = "forward" if _works(_directional, residuals, u) else "central"
-    return (at, forward, None) if jacobian == "forward" else (at, central, differences)
+    return at, central, differences
 
 
-def _directional(residuals: Callable, u: Array, direction: Array | None = None) -> tuple[Array, Array]:
-    """Residuals and their derivative along a direction."""
-    return jax.jvp(residuals, (u,), (jnp.ones_like(u) if direction is None else direction,))
-
-
-def _works(transform: Callable, residuals: Callable, u: np.ndarray) -> bool:
-    """Whether JAX can trace something of the residuals; a host callback has no derivative, plain NumPy no trace."""
+def _traceable(residuals: Callable, u: np.ndarray) -> bool:
+    """Whether JAX can trace the residuals; plain NumPy has no trace."""
     try:
-        jax.eval_shape(lambda u: transform(residuals, u), jnp.asarray(u))
+        jax.eval_shape(residuals, jnp.asarray(u))
     except (jax.errors.JAXTypeError, TypeError, ValueError, NotImplementedError):
         return False
     return True

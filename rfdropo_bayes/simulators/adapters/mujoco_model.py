@@ -137,7 +137,6 @@ def MuJoCo(
     name: str | None = None,
     lanes: int = LANES,
     threads: int | None = None,
-    difference: float | None = None,
 ) -> BlackBox:
     """A MuJoCo model in the place of a robot.
 
@@ -159,7 +158,6 @@ def MuJoCo(
         name: name in reports; the model's own by default.
         lanes: number of parameter sets simulated at once.
         threads: number of threads; one per processor by default.
-        difference: see `BlackBox`.
 
     Raises:
         InputError: no such file, a file that MuJoCo cannot read, or unknown names and addresses, with the nearest
@@ -197,7 +195,6 @@ def MuJoCo(
         name=name or spec.modelname or Path(path).stem,
         batched=True,
         lanes=lanes,
-        difference=difference,
         usual_command=rollouts.usual_command,
         families=families,
         limits=rollouts.limits,
