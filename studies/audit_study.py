@@ -27,7 +27,7 @@ from rfdropo_bayes.mechanisms import REGISTRY
 from rfdropo_bayes.model.experiment import CommandsTable
 from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.verbs.audit import JOURNAL, Workshop, audit
-from studies.fits import Job, run_fits
+from studies.fits import Job, run_fits, uninterrupted
 from studies.hidden_effects import EARLIER, Hidden, Setting, hide
 
 RESULT, TABLE, LEDGER = "audit_power.json", "audit_power.md", "datasets.jsonl"
@@ -217,7 +217,8 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
     turn = _turn(library, condition.effects, [job["seed"], CONDITIONS.index(condition)], index)
     hidden, names, unreached = _hidden(condition, turn, number, library, exclude, place, _WORKSHOP)
     given = [] if condition.repeats else [ONCE]
-    found = audit(Model.read(hidden.experiment, given), out=place / "audit", workshop=_WORKSHOP, overwrite=True)
+    model = Model.read(hidden.experiment, given)
+    found = uninterrupted(audit(model, out=place / "audit", workshop=_WORKSHOP, overwrite=True))
     content, answer = found.content, found.answer
     assert answer is not None
     prior = answer.problem.coordinates.prior_deviations
@@ -226,8 +227,8 @@ def _one(job: Job, library: Sequence[str], exclude: Sequence[str], folder: Path)
         # What the base model does is the same in both.
         shutil.copytree(place / "audit" / JOURNAL, place / "removed" / JOURNAL, dirs_exist_ok=True)
         less = [_without(content, names, exclude)]
-        model = Model.read(hidden.experiment, less)
-        content = audit(model, out=place / "removed", workshop=_WORKSHOP, resume=True).content
+        lacking = Model.read(hidden.experiment, less)
+        content = uninterrupted(audit(lacking, out=place / "removed", workshop=_WORKSHOP, resume=True)).content
         judged = {**judge(content, names, hidden, prior), "error_over_oracle": None, WHOLE: judged}
     return {
         "hidden": names,

@@ -31,7 +31,7 @@ from rfdropo_bayes.model.model_spec import spec_of
 from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.audit import Workshop, audit, build_problem
-from studies.fits import Job, run_fits
+from studies.fits import Job, run_fits, uninterrupted
 from studies.hidden_effects import Setting, absorbing, blank_recordings, experiment_tables, noisy
 from studies.mujoco_truth import ENGINE_EFFECTS, EngineArm, EngineEffect, MuJoCoArm
 from studies.pyelastica_truth import ELASTICA_EFFECTS, ElasticaArm
@@ -129,7 +129,7 @@ def _adopted(truth: Truth, out: Path, seed: int) -> dict[str, Any]:
         place = _recorded(truth, own, None, 0.0, [seed, 0], out / BASE / "data")
         assert place is not None
         asked = Model.read(place / "audit.toml", ["audit.ports=false"])  # laws are not adopted
-        found = audit(asked, out=out / BASE / "audit", workshop=_WORKSHOP, overwrite=True)
+        found = uninterrupted(audit(asked, out=out / BASE / "audit", workshop=_WORKSHOP, overwrite=True))
         stored.write_text(json.dumps(_with_findings(own, found.content["findings"])), encoding="utf-8")
         (out / BASE / "sentence.txt").write_text(found.sentence + "\n", encoding="utf-8")
     return dict(json.loads(stored.read_text(encoding="utf-8")))
@@ -155,7 +155,8 @@ def _one(job: Job, truth: Truth, base: Mapping[str, Any], folder: Path) -> dict[
     hidden = _recorded(truth, base, effect, float(job["rho"]), number, place)
     if hidden is None:
         return {"verdict": "no size reaches this rho"}
-    found = audit(Model.read(hidden / "audit.toml"), out=place / "audit", workshop=_WORKSHOP, overwrite=True)
+    asked = Model.read(hidden / "audit.toml")
+    found = uninterrupted(audit(asked, out=place / "audit", workshop=_WORKSHOP, overwrite=True))
     classes = [row["equivalence_class"] for row in found.content["findings"]]
     right = set(effect.right) if effect else set()
     return {

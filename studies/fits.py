@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from rfdropo_bayes.discrepancy.deadline import INTERRUPT
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import append_line, read_lines, write_text
 from rfdropo_bayes.inference.progress import Progress
+from rfdropo_bayes.verbs.audit import Audit
 
 LOCAL = "local"
 RETRIES = 3  # of a fit whose worker died
@@ -50,6 +52,17 @@ def run_fits(
         if progress is not None:
             progress.stage((len(jobs) - len(left) + count + 1) / len(jobs), **job)
     return [{**job, **known[_name(job)][1]} for job in jobs]
+
+
+def uninterrupted(found: Audit) -> Audit:
+    """An audit that was done to the end, or to its time; the results of an interrupted audit are no row of a study.
+
+    Raises:
+        KeyboardInterrupt: the audit was interrupted.
+    """
+    if found.content["stopped"] == INTERRUPT:
+        raise KeyboardInterrupt
+    return found
 
 
 def finished(jobs: Sequence[Job], log: Path) -> list[dict[str, Any]]:

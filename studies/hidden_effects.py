@@ -160,7 +160,7 @@ def hide(
             return None
         base = span(measured.jacobian(truth, np.arange(coordinates.base)))
         effect = project_out(base, (measured.residual(truth[None]) - measured.residual(moved[None])).T)
-        level = problem.rules.base_passes / len(problem.candidates)
+        level = problem.rules.level / len(problem.candidates)
         ideal[name] = float(ncx2.sf(chi2.isf(level, len(index)), len(index), np.sum(effect**2)))
         truth = moved
         sizes[name] = rho

@@ -355,7 +355,7 @@ def _where(answer: Answer) -> dict[str, Any]:
     markers = problem.model.recordings.markers
     misfit = np.sqrt(scores.misfit.reshape(-1, 3).mean(axis=1))
     return {
-        "sentence": in_words(scores, markers, problem.rules.base_passes, problem.timed),
+        "sentence": in_words(scores, markers, problem.rules.level, problem.timed),
         "block_edges_s": scores.edges.tolist(),
         "prequential_score": scores.score.tolist(),
         "block_p": scores.p.tolist(),

@@ -163,7 +163,7 @@ def _beside(problem: AuditProblem, model: Named, report: Callable[[str], None]) 
     simulator: Any = problem.lanes.simulator
     assert problem.ports is not None
     channels, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    options = (problem.ports, channels, unit, problem.seed, problem.rules.family, report, problem.groups, problem.timed)
+    options = (problem.ports, channels, unit, problem.seed, problem.rules.level, report, problem.groups, problem.timed)
     before = stages_of(model.search.target, model.base, model.steps)
     named = len(before) - 1
     for law in law_search(model.fit_target, *options).laws(model.fit_target, model.fit):

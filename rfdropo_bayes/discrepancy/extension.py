@@ -33,7 +33,8 @@ class Rules:
     """Numbers the verdict depends on, fixed in advance.
 
     Attributes:
-        family: probability that the score tests name a candidate although the model is right.
+        level: probability of a false alarm if the model is right: by the joint test, or by score tests that name a
+            candidate.
         class_cosine: cosine above which signatures are one class.
         classes: number of leading classes to refit; members: total number of candidates to refit.
         effects: number of mechanisms beyond which a further mechanism must take a significant share of the misfit away,
@@ -43,12 +44,12 @@ class Rules:
             difference of the best are equivalent.
         bootstraps: number of simulated data sets per p-value.
         minutes: limit of the whole audit; it then finishes with its present results.
-        base_passes, extended_passes: p-values of the joint test above which a model passes.
+        extended_passes: p-value of the joint test above which an extended model passes.
         explained, significant: shares of the discrepancy for "explained" and for "partly explained".
         matters: distance of a marker [m] below which a discrepancy does not matter; None if not stated.
     """
 
-    family: float = 0.02
+    level: float = 0.02
     class_cosine: float = 0.95
     classes: int = 4
     members: int = 8
@@ -56,7 +57,6 @@ class Rules:
     evidence: float = 3.0
     bootstraps: int = 999
     minutes: float = 30.0
-    base_passes: float = 0.01
     extended_passes: float = 0.05
     explained: float = 0.8
     significant: float = 0.2
@@ -187,7 +187,7 @@ class ExtensionSearch:
                 return replace(tests, omnibus=self._tested(fit, len(without)), finer=None)
             if tests.finer is None:
                 return tests
-            seen = tests.row(DISCRETISATION).adjusted_p <= self.rules.family
+            seen = tests.row(DISCRETISATION).adjusted_p <= self.rules.level
             if seen and self._below_the_noise(fit):
                 # The simulation without its error in space and time, estimated from two resolutions. The change by
                 # halving the steps is a part of the error: half at first order of the time steps, three quarters at
@@ -228,7 +228,7 @@ class ExtensionSearch:
     def refits(self, tests: ScoreTests) -> Iterator[Refits]:
         """The leading classes, one candidate refitted after the other; then the best of them from afar, see
         `_from_distant_starts`."""
-        significant = [row for row in tests.rows if row.adjusted_p <= self.rules.family and row.probe is not None]
+        significant = [row for row in tests.rows if row.adjusted_p <= self.rules.level and row.probe is not None]
         if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(tests.fit):
             significant = [row for row in significant if row.name != DISCRETISATION]
         leads = {row.name: self._lead(tests.fit, row) for row in significant}

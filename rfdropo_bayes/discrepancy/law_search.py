@@ -158,9 +158,9 @@ class LawResult:
         """The first term and its ties; empty without a law."""
         return [*self.terms[:1], *self.ties]
 
-    def significant(self, family: float) -> list[PortEvidence]:
+    def significant(self, level: float) -> list[PortEvidence]:
         """Ports with a significant effect."""
-        return [row for row in self.ports if row.adjusted_p <= family and row.log_evidence > 0.0]
+        return [row for row in self.ports if row.adjusted_p <= level and row.log_evidence > 0.0]
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,7 @@ class LawSearch:
         own: features of a cable's own command, for ports of several cables.
         units: names and unit of the commands.
         seed: seed of simulated data sets.
-        family: probability that a port is named although nothing is missing.
+        level: probability that a port is named although nothing is missing.
         report: called with a line of words.
         most: largest number of terms; None leaves it to the recordings.
         taken: names of coefficients in the model, from laws of an earlier audit.
@@ -295,7 +295,7 @@ class LawSearch:
     own: Sequence[Feature]
     units: tuple[tuple[str, ...], str]
     seed: int
-    family: float
+    level: float
     report: Callable[[str], None] = lambda line: None
     most: int | None = None
     taken: frozenset[str] = frozenset()
@@ -326,7 +326,7 @@ class LawSearch:
         law = LawResult(self.ports, where, [], [], [], centre, None)
         yield law
         try:
-            while len(law.terms) != self.most and (where[0].adjusted_p <= self.family or (forced and not law.terms)):
+            while len(law.terms) != self.most and (where[0].adjusted_p <= self.level or (forced and not law.terms)):
                 terms = law.terms
                 if not terms:
                     linear = self._sharpened(known, fit, linear, values, where)
@@ -396,14 +396,14 @@ class LawSearch:
         return draws[:, : linear.residual.size]
 
     def _null_quantile(self, linear: Responses, values: np.ndarray, null: Float[np.ndarray, "draw n"]) -> float:
-        """Gain [nat] that the best of all features at all ports has in a share `family` of data sets that lack
+        """Gain [nat] that the best of all features at all ports has in a share `level` of data sets that lack
         nothing."""
         series = np.moveaxis(null.reshape(-1, *linear.residual.shape), 0, 2)
         most = np.full(len(null), -np.inf)
         for port in self.ports.ports:
             for _, columns in self._scoped(linear, feature_columns(linear, port, self._offered(port, values)[1])):
                 most = np.maximum(most, cross_validated_gains(_sums(linear, columns, series))[0][:, 1:].max(axis=0))
-        return float(np.quantile(most, 1.0 - self.family, method="higher"))
+        return float(np.quantile(most, 1.0 - self.level, method="higher"))
 
     def _ranked(
         self, linear: Responses, values: np.ndarray, null_quantile: float,
@@ -641,7 +641,7 @@ def _relinearised(known: FitTarget, linear: Responses, fit: Fit) -> Responses:
 
 
 def law_search(
-    target: FitTarget, ports: PortMap, channels: Sequence[str], unit: str, seed: int, family: float,
+    target: FitTarget, ports: PortMap, channels: Sequence[str], unit: str, seed: int, level: float,
     report: Callable[[str], None], groups: Groups | None = None, timed: bool = True,
 ) -> LawSearch:  # fmt: skip
     """The search on a simulator with these ports and commands, for laws of all recordings and of single groups."""
@@ -655,4 +655,4 @@ def law_search(
     members = {} if groups is None else groups.members
     scopes = (EVERYWHERE, *(Scope(name, recordings) for name, recordings in members.items()))
     units = (tuple(channels), unit)
-    return LawSearch(ports, table, own, units, seed, family, report, taken=taken, scopes=scopes, timed=timed)
+    return LawSearch(ports, table, own, units, seed, level, report, taken=taken, scopes=scopes, timed=timed)

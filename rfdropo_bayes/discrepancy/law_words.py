@@ -167,7 +167,7 @@ def ports_sentence(answer: Answer) -> str:
     described = answer.described
     if described is None or described.holds:
         return ""
-    rows = described.search.significant(answer.problem.rules.family)
+    rows = described.search.significant(answer.problem.rules.level)
     if not rows:
         return ""
     residual = answer.extended.residual

@@ -115,7 +115,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
         named = replace(named, tests=tests)
         yield named
         p = tests.omnibus.p
-        if not named.steps and p > rules.base_passes:
+        if not named.steps and p > rules.level:
             return
         first = tests.rows[0].name if tests.rows else "none"
         report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")

@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float
 from scipy.stats import norm, rankdata
 
 DIRECTED = "candidates"  # the statistic that is the largest score of any candidate
+# Share of the level that this statistic gets. Of 24 effects of rho .15 all have a p-value of at most .015 by it, and
+# six have one of at most .005 by another statistic.
+SHARE = 0.75
 BLOCK = 10  # rows
 LAGS = 10
 
@@ -85,10 +88,10 @@ def joint_test(
 ) -> Omnibus:
     """Calibrate each statistic, and the smallest p-value, against the simulated statistics.
 
-    The largest score of the candidates counts as much as all other statistics together: five statistics that ask
-    whether anything at all is wrong must not hide the effect of a known cause. The observed data set is ranked among
-    the simulated data sets in every step: under a right model it is one of them, and the joint p-value is then valid at
-    any level. Ties in the smallest p-value are broken by the distance from the median.
+    The largest score of the candidates has `SHARE` of the level, all other statistics together have the rest: five
+    statistics that ask whether anything at all is wrong must not hide the effect of a known cause. The observed data
+    set is ranked among the simulated data sets in every step: under a right model it is one of them, and the joint
+    p-value is then valid at any level. Ties in the smallest p-value are broken by the distance from the median.
     """
     single = {}  # p-value of each data set, and its distance from the median in distances of the 95 % quantile
     for name in observed:
@@ -96,8 +99,10 @@ def joint_test(
         middle, high = np.quantile(values, [0.5, 0.95])
         p = (len(values) - np.searchsorted(np.sort(values), values, side="left")) / len(values)
         single[name] = p, (values - middle) / max(high - middle, 1e-300)
-    halves = [_smallest([both for name, both in single.items() if name != DIRECTED])]
-    joint, _ = _smallest([*halves, single[DIRECTED]] if DIRECTED in single else halves)
+    joint, distance = _smallest([both for name, both in single.items() if name != DIRECTED])
+    if DIRECTED in single:
+        p, beyond = single[DIRECTED]
+        joint, _ = _smallest([(joint / (1.0 - SHARE), distance), (p / SHARE, beyond)])
     return Omnibus(float(joint[-1]), {name: float(p[-1]) for name, (p, _) in single.items()}, blocks)
 
 

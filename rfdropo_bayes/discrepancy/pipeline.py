@@ -300,7 +300,7 @@ def findings(begun: Results, report: Callable[[str], None]) -> Iterator[Results]
         if stated.noise.source == STATED:  # would the base model pass under a noise fitted to its residuals?
             other, fit = under_residual_noise(stated, as_measured(last.search.target, last.base))
             p = search.under(other).score_tests(fit).omnibus.p
-            passing = p > problem.rules.base_passes and not other.noise.doubtful
+            passing = p > problem.rules.level and not other.noise.doubtful
             results = replace(results, suspected=other.noise if passing else None)
         yield results
     # A discrepancy that the library does not explain, or a base model that could not be fitted for it. A model that

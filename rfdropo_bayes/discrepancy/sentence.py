@@ -124,7 +124,7 @@ def _beginning(answer: Answer) -> str:
     if answer.verdict == NO_DISCREPANCY or not answer.converged:
         return ""
     scores = prequential(answer.target, answer.base)
-    return f" {BEGINNING}" if begins_wrong(scores, answer.problem.rules.base_passes) else ""
+    return f" {BEGINNING}" if begins_wrong(scores, answer.problem.rules.level) else ""
 
 
 def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
@@ -143,7 +143,7 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
             "No discrepancy: the base model's residuals are consistent with noise in these data (joint "
             f"test p {_p(answer)}{finer}{_assumption(answer)}).{_invisible(answer)}"
         )
-    if not findings and answer.test_series[0].omnibus.p > answer.problem.rules.base_passes:
+    if not findings and answer.test_series[0].omnibus.p > answer.problem.rules.level:
         distance = 1e3 * noise_distance(answer.target.noise.first)
         return (
             f"The base model's residuals, {distance:.2g} mm, change too slowly to be measurement noise, "
@@ -208,7 +208,7 @@ def _leading(answer: Answer) -> str:
     if refits:
         brings = ", ".join(f"{spoken(name)} {gained:.0f} nats" for name, gained in refits)
         return f"no refitted candidate has the required evidence ({brings})"
-    seen = [row for row in answer.test_series[0].rows if row.adjusted_p <= answer.problem.rules.family]
+    seen = [row for row in answer.test_series[0].rows if row.adjusted_p <= answer.problem.rules.level]
     if not answer.test_series[0].rows:
         return "no candidate was tested"
     if not seen:
@@ -335,7 +335,7 @@ def _pattern(answer: Answer) -> str:
     """Clause about an extended model that fails the joint test."""
     rules, last = answer.problem.rules, answer.test_series[-1].omnibus.p
     words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
-    sure = last <= rules.base_passes and not _only_noise(answer)
+    sure = last <= rules.level and not _only_noise(answer)
     return f"{words}: something else is at work" if sure else words
 
 

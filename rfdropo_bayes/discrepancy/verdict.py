@@ -52,7 +52,7 @@ def decide(
 ) -> str:
     """Apply the rules.
 
-    - no_discrepancy: the base model passes the joint test (p > .01), under a plausible noise;
+    - no_discrepancy: the base model passes the joint test, under a plausible noise;
     - unexplained: it fails, and no candidate is significant, or all together explain at most 20 %, or they worsen the
       prediction of unseen trajectories;
     - explained: the extended model passes (p > .05) or leaves a negligible residual, the lower bound of the explained
@@ -68,7 +68,7 @@ def decide(
         doubtful: see `Stacked.doubtful`.
         small: whether what the extended model leaves is `negligible`.
     """
-    if base_p > rules.base_passes and not doubtful:
+    if base_p > rules.level and not doubtful:
         return NO_DISCREPANCY
     if not class_sizes or extended_p is None:
         return UNEXPLAINED

@@ -131,7 +131,7 @@ def class_effects(answer: Answer) -> list[figures.ClassEffect]:
     first, rules = answer.test_series[0], answer.problem.rules
     heads: list[list[ScoreRow]] = []
     for row in first.rows:
-        if row.probe is None or row.adjusted_p > rules.family:
+        if row.probe is None or row.adjusted_p > rules.level:
             continue
         own = next((h for h in heads if _alike(h[0], row) > rules.class_cosine), None)
         if own is not None:
@@ -172,7 +172,7 @@ def _effect(answer: Answer, tests: ScoreTests, members: Sequence[ScoreRow]) -> f
 def _signal(answer: Answer) -> figures.Signal | None:
     """The signal at the port of the law, of its members the one of most evidence; without a law at the port of most."""
     described = answer.described
-    if described is None or not described.search.significant(answer.problem.rules.family):
+    if described is None or not described.search.significant(answer.problem.rules.level):
         return None
     row, terms = described.search.ports[0], described.search.terms
     if terms:

@@ -136,7 +136,7 @@ def _design(
     with clock.part(SCREENED_BY, SCREENING):
         scores = search.score_tests(fitted)
     hypotheses = [] if scores is None else _hypotheses(search, scores, clock, report)
-    wrong = scores is not None and scores.omnibus.p <= problem.rules.base_passes
+    wrong = scores is not None and scores.omnibus.p <= problem.rules.level
     if wrong and (alternatives := _alternatives(problem, target, fitted, clock, report)):
         target, fitted, hypotheses = _with_laws(problem, target, fitted, hypotheses, alternatives)
     tried = list(proposals(runs[0], runs, rng))
@@ -170,7 +170,7 @@ def _hypotheses(
     search: ExtensionSearch, scores: ScoreTests, clock: Clock, report: Callable[[str], None]
 ) -> list[Hypothesis]:
     """The leading significant candidates, each refitted."""
-    rows = [row for row in scores.rows if row.adjusted_p <= search.rules.family and row.name != DISCRETISATION]
+    rows = [row for row in scores.rows if row.adjusted_p <= search.rules.level and row.name != DISCRETISATION]
     report(f"{len(rows)} candidates are significant")
     hypotheses = []
     for row in rows[: 2 * HYPOTHESES]:
@@ -191,7 +191,7 @@ def _alternatives(
         return []
     simulator: Any = problem.lanes.simulator
     names, unit = tuple(simulator.channel_names), str(getattr(simulator, "command_unit", "m"))
-    options = (problem.ports, names, unit, problem.seed, problem.rules.family, report, None, problem.timed)
+    options = (problem.ports, names, unit, problem.seed, problem.rules.level, report, None, problem.timed)
     alternatives: list[Refit] = []
     with clock.part(LAWS_BY, "laws at ports"):
         search = replace(law_search(target, *options), most=1)

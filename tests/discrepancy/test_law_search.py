@@ -115,7 +115,7 @@ def searched(toy, alike=False):
     """Problem, fit target, base model and the search's findings of recordings of a toy."""
     question = asked(6, toy, alike)
     target, base = base_model(question, question.seed)
-    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.level, lambda line: None)
     return question, target, base, law_search(target, *options).find(target, base)
 
 
@@ -203,7 +203,7 @@ def test_a_model_that_is_far_off_is_told_no_size_of_a_signal(left, said):
     row = SimpleNamespace(port=Port("marker tip x", "sensing", "marker", 0, 0, "m", 1e-3, ""), amplitude=0.002)
     found = SimpleNamespace(significant=lambda family: [row])
     described = SimpleNamespace(holds=False, search=found, last=None)
-    problem = SimpleNamespace(rules=SimpleNamespace(family=0.02))
+    problem = SimpleNamespace(rules=SimpleNamespace(level=0.02))
     answer = SimpleNamespace(described=described, problem=problem, extended=SimpleNamespace(residual=np.full(9, left)))
     assert said in ports_sentence(answer)
     assert ports_sentence(answer).endswith("no law of it holds.")
@@ -214,7 +214,7 @@ def test_a_term_that_unseen_recordings_do_not_support_is_cut(monkeypatch):
     """A search whose later terms bring nothing, because they are the first term again, ends after two of them."""
     question = asked(5, Pushed())
     target, base = base_model(question, question.seed)
-    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.level, lambda line: None)
     search = replace(law_search(target, *options), most=1)
     once = search.find(target, base)
 
@@ -245,7 +245,7 @@ def test_a_law_in_a_model_that_is_far_off_is_found_under_the_noise_that_candidat
     assert term.target.known is not None  # the rest is still there
     assert found.ports[0].port.name == "marker m3 x"
     assert 0.0 < found.ports[0].log_evidence < term.gain.gain < 0.1 * rows
-    assert [row.port.name for row in found.significant(question.rules.family)] == ["marker m3 x"]
+    assert [row.port.name for row in found.significant(question.rules.level)] == ["marker m3 x"]
     scale = term.term.spec.prior["scale"]
     assert abs(scale * term.fit.x[-1] - LARGE) < 3.0 * scale * np.sqrt(term.fit.covariance[-1, -1])
     assert 0.0 < term.gain.share < 1.0
@@ -272,7 +272,7 @@ def test_no_law_is_found_in_a_model_that_is_far_off_for_another_reason():
     question, target, _, found = searched(Elsewhere())
     assert target.known is not None
     assert found.terms == []
-    assert found.significant(question.rules.family) == []
+    assert found.significant(question.rules.level) == []
 
 
 @pytest.mark.slow
@@ -311,7 +311,7 @@ def test_responses_under_another_noise_are_those_that_rollouts_give_under_it():
 def test_what_a_term_brings_beside_a_model_is_told_by_rollouts_of_that_model():
     """At a port of sensing, which is linear, it is what the responses say; of a model that has the law it is little."""
     question, target, base, found = searched(Pushed())
-    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.level, lambda line: None)
     search = law_search(target, *options)
     given = responses(target, base, question.ports, search.table)
     values = search.table.over(given.levels)
@@ -335,7 +335,7 @@ def test_signals_are_timed_from_the_first_row_on():
     forward = copy.copy(target.forward)
     step = forward.commands.sample_step
     forward.commands = forward.commands._replace(sample_step=np.minimum(step + 4, step.max()))
-    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.family, lambda line: None)
+    options = (question.ports, ("a", "b"), "m", question.seed, question.rules.level, lambda line: None)
     plain, early = (law_search(t, *options).find(t, base) for t in (target, target.on(forward)))
     assert plain.centre[0] == 0.0
     np.testing.assert_allclose(early.centre, plain.centre - 4 * STEP, atol=1e-12)

@@ -110,7 +110,7 @@ def test_a_limit_that_only_rounding_shows_at_null_is_found_on_its_grid():
     asked = problem_of(Stopped(), {**TRUTH, "limit": 1.0}, 5)
     target, base = base_model(asked, asked.seed)
     search = ExtensionSearch(target, asked.candidates, asked.rules, asked.seed)
-    assert search.score_tests(base).row("limit").adjusted_p <= asked.rules.family
+    assert search.score_tests(base).row("limit").adjusted_p <= asked.rules.level
 
 
 def test_trial_values_of_large_families_without_visible_effect_stay_few():
@@ -182,11 +182,11 @@ def test_what_an_error_of_the_mesh_hides_is_found_on_the_finer_one():
     assert abs(sizes.mean() - 0.15) < 4 * sizes.std()
 
 
-@pytest.mark.parametrize(("error", "family", "named"), [(LARGE, 0.02, ["discretisation"]), (SMALL, 0.0, [])])
-def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, family, named):
+@pytest.mark.parametrize(("error", "level", "named"), [(LARGE, 0.02, ["discretisation"]), (SMALL, 0.0, [])])
+def test_an_error_of_the_mesh_is_named_or_else_no_discrepancy(error, level, named):
     """Where nothing may be named, an error of the mesh is let pass."""
     asked = on_a_coarse_mesh(problem(TRUTH, 102), error)
-    answer = audit(replace(asked, rules=replace(asked.rules, family=family)))
+    answer = audit(replace(asked, rules=replace(asked.rules, level=level)))
     assert [step.name for step in answer.steps] == named
     assert answer.verdict == ("explained" if named else "no_discrepancy")
     assert answer.test_series[0].refined is not bool(named)
@@ -459,7 +459,7 @@ def test_slopes_that_show_pass_over_a_kink():
 
     asked = problem(TRUTH, 1)
     straight = first_target(asked, Journal())
-    kinked = first_target(replace(asked, lanes=Lanes(Kinked(), np.arange(4))), Journal())
+    kinked = first_target(replace(asked, lanes=Lanes(Kinked(), np.arange(4)).with_difference(1e-7)), Journal())
     points = straight.forward.coordinates.encode(TRUTH)[None]
     direction = np.eye(points.shape[1])[[asked.coordinates.space.names.index("play")]]
     slope = straight.slopes(points, direction)[0]
@@ -541,7 +541,7 @@ def test_a_candidate_that_brings_nearly_as_much_is_named_beside_the_best():
     """However little its signature is like that of the best: within three nats these data do not tell the two apart."""
     asked = problem({**TRUTH, "play": 1.0}, 1)
     target, base = base_model(asked, 0)
-    search = ExtensionSearch(target, asked.candidates, replace(asked.rules, family=1.0), 0)
+    search = ExtensionSearch(target, asked.candidates, replace(asked.rules, level=1.0), 0)
     tests = search.score_tests(base)
     brings = {"play": 20.0, "creep": 18.0, "wall": 16.0}
     fits = {name: replace(base, log_evidence=base.log_evidence + nats) for name, nats in brings.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.mechanisms import REGISTRY
 from studies.audit_study import CONDITIONS, FAMILIES, LEDGER, TABLE, WHOLE, _turn, _without, judge, run_study, summarise
+from studies.fits import uninterrupted
 from studies.hidden_effects import Hidden
 
 CONTENT = {
@@ -146,3 +148,10 @@ def test_where_nothing_is_to_be_found_the_audit_is_on_a_finer_mesh():
     audited = [c.setting.audited["refine"] for c in layered]
     assert [c.setting.made["refine"] - fine for c, fine in zip(layered, audited, strict=True)] == [1] * len(layered)
     assert {c.effects == 0 for c, fine in zip(layered, audited, strict=True) if fine == 4} == {True}
+
+
+def test_an_interrupted_audit_ends_a_study():
+    ended = SimpleNamespace(content={"stopped": "time"})
+    assert uninterrupted(ended) is ended
+    with pytest.raises(KeyboardInterrupt):
+        uninterrupted(SimpleNamespace(content={"stopped": "interrupt"}))
