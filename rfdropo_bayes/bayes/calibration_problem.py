@@ -226,13 +226,8 @@ class CalibrationProblem:
     def _side_by_side(self, features: Shaped[Any, "n recording time f"]) -> Shaped[np.ndarray, "n time recording*f"]:
         return np.moveaxis(np.asarray(features), 1, 2).reshape(len(features), features.shape[2], -1)
 
-    def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Array, " residual"]:
-        """Whitened residuals of the first ``horizon`` rows (zero if masked); traceable, for one set of values."""
-        white = self.model.residuals(values, jnp.asarray(self.steps_for(horizon)), self.measured, self.shares)
-        return self._flat({name: part[None] for name, part in white.items()}, horizon)[0]
-
-    def residual_batch(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
-        """`residuals` of many sets of values at once, in compiled chunks."""
+    def residuals(self, values: Batch, horizon: int) -> Float[np.ndarray, "n residual"]:
+        """Whitened residuals of the first ``horizon`` rows, zero if masked, in compiled chunks."""
         return np.asarray(self._flat(self._white(values, horizon, self.shares), horizon))
 
     def _white(self, values: Batch, horizon: int, shares: Mapping[str, float]) -> dict[str, np.ndarray]:
@@ -261,8 +256,8 @@ class CalibrationProblem:
         out.
         """
         values = {name: jax.ShapeDtypeStruct((), float) for name in self.names}
-        steps = jnp.asarray(self.steps_for(self.n_rows))
-        shapes = jax.eval_shape(lambda v: self.model.residuals(v, steps, self.measured), values)
+        model = self.model
+        shapes = jax.eval_shape(lambda v: model.white(model.seen(model.simulate(v), v), self.measured), values)
         names = self.model.channel_names
         ends = np.cumsum([shapes[name].size for name in names])
         parts = dict(zip(names, np.split(residuals, ends[:-1], axis=-1), strict=True))

@@ -4,7 +4,7 @@ behind it.
 | a protocol | for |
 |---|---|
 | `Problem` | every method |
-| `ResidualProblem`, `BatchedResiduals` | Gauss-Newton optimisation |
+| `ResidualProblem` | Gauss-Newton optimisation |
 | `WarmStart` | optimisations from an earlier posterior |
 | `Hierarchy` | optimisations with standard deviations among the parameters |
 | `RolloutProblem` | RF-DROPO |
@@ -115,21 +115,12 @@ class ResidualProblem(Problem, Protocol):
     @property
     def prior_derivatives(self) -> Derivatives: ...
 
-    def residuals(self, values: Mapping[str, Float[Array, ""]], horizon: int) -> Float[Any, " m"]:
-        """Whitened residuals r of the first ``horizon`` rows for ONE set of values.
+    def residuals(self, values: Values, horizon: int) -> Float[Any, "n m"]:
+        """Whitened residuals r of the first ``horizon`` rows for each set of values.
 
-        ``-0.5 * sum(r**2) + c`` is the log likelihood, with ``c`` a function of noise parameters only. Residuals that
-        JAX can trace are computed for many points at once.
+        ``-0.5 * sum(r**2) + c`` is the log likelihood, with ``c`` a function of noise parameters only. Jacobians are
+        central differences.
         """
-        ...
-
-
-@runtime_checkable
-class BatchedResiduals(ResidualProblem, Protocol):
-    """A problem that simulates many sets of values at once, for central differences of its residuals."""
-
-    def residual_batch(self, values: Values, horizon: int) -> Float[Any, "n m"]:
-        """`residuals` of many sets of values."""
         ...
 
 

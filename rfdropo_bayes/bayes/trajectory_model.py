@@ -124,20 +124,13 @@ class TrajectoryModel:
         assert isinstance(self.simulator, Placing)
         return self.simulator.with_object_at(physical, self._poses.measured[self.recordings.names.index(recording), 0])
 
-    def simulate(self, values: Values, steps: Int[Array, ""] | None = None) -> Observation:
-        """Roll out every recording under a set of values.
-
-        Args:
-            values: inferred parameters, scalars.
-            steps: simulate only this many time steps (later rows are meaningless); None for all, differentiable in
-                reverse mode.
-
-        Returns:
-            observations with a leading axis over recordings, and the recordings' markers.
+    def simulate(self, values: Values) -> Observation:
+        """Roll out every recording under a set of values, scalars: observations of the recordings' markers, with a
+        leading axis over recordings.
         """
         per_recording = [self.rollout_values(values, name) for name in self.recordings.names]
         stacked = {name: jnp.stack([row[name] for row in per_recording]) for name in per_recording[0]}
-        observed = jax.vmap(lambda v, c: self.simulator.rollout(v, c, steps))(stacked, self.recordings.commands)
+        observed = jax.vmap(lambda v, c: self.simulator.rollout(v, c))(stacked, self.recordings.commands)
         return observed._replace(position=observed.position[:, :, self.recordings.marker_index])
 
     def seen(self, observation: Observation, values: Values) -> Seen:
@@ -145,23 +138,13 @@ class TrajectoryModel:
         offset = jnp.stack([offset_of(self.rollout_values(values, name)) for name in self.recordings.names])
         return Seen(observation, {**self.scopes.fixed, **values}, offset)
 
-    def row_log_likelihood(
-        self,
-        values: Values,
-        steps: Int[Array, ""] | None = None,
-        measured: Measured | None = None,
-        shares: Mapping[str, Any] | None = None,
+    def row_density(
+        self, seen: Seen, measured: Measured | None = None, shares: Mapping[str, Any] | None = None
     ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
         """Log density of each row given the earlier rows, summed over recordings, and the worst result code.
 
         ``measured`` replaces the model's own data; ``shares`` are the weights of channels.
         """
-        return self.row_density(self.seen(self.simulate(values, steps), values), measured, shares)
-
-    def row_density(
-        self, seen: Seen, measured: Measured | None = None, shares: Mapping[str, Any] | None = None
-    ) -> tuple[Float[Array, " time"], Int[Array, ""]]:
-        """See `row_log_likelihood`, of an observation."""
         data = self.measured if measured is None else measured
         rows = jnp.zeros(self.recordings.time.shape[1])
         for channel in self.channels:
@@ -170,20 +153,12 @@ class TrajectoryModel:
             rows = rows.at[: len(density)].add(density)
         return rows, jnp.max(seen.observation.status)
 
-    def residuals(
-        self,
-        values: Values,
-        steps: Int[Array, ""],
-        measured: Measured | None = None,
-        shares: Mapping[str, Any] | None = None,
-    ) -> dict[str, Float[Array, "..."]]:
-        """Whitened residuals by channel, zero if masked; see `Channel.residuals` and `row_log_likelihood`."""
-        return self.white(self.seen(self.simulate(values, steps), values), measured, shares)
-
     def white(
         self, seen: Seen, measured: Measured | None = None, shares: Mapping[str, Any] | None = None
     ) -> dict[str, Float[Array, "..."]]:
-        """See `residuals`, of an observation."""
+        """Whitened residuals of an observation by channel, zero if masked; see `Channel.residuals` and
+        `row_density`.
+        """
         data = self.measured if measured is None else measured
         white = {channel.name: channel.residuals(seen, data[channel.name]) for channel in self.channels}
         return white if shares is None else {name: jnp.sqrt(shares[name]) * part for name, part in white.items()}

@@ -356,14 +356,10 @@ class Posterior(ProblemDefaults):
         rows[:, 0] -= 0.5 * np.sum(weighed**2, axis=1)
         return np.where(fine[:, None], rows, -np.inf), np.where(fine, 0, 1)
 
-    def residual_batch(self, values: Mapping[str, Any], horizon: int) -> Float[Any, "n m"]:
+    def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, "n m"]:
         """Whitened residuals of a prefix."""
         white, weighed, fine = self._rows(values, horizon)
         return np.where(fine[:, None], np.concatenate([white.reshape(len(white), -1), weighed], axis=1), np.inf)
-
-    def residuals(self, values: Mapping[str, Any], horizon: int) -> Float[Any, " m"]:
-        """Residuals at one set of values."""
-        return self.residual_batch({name: np.atleast_1d(value) for name, value in values.items()}, horizon)[0]
 
     def _rows(self, values: Mapping[str, Any], horizon: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Whitened residuals of a prefix, of weighed parts, and the mask of successful rollouts.

@@ -72,7 +72,7 @@ def fit_session(
         return given | {p.name: physical_of_normal(p, x, given) for p, x in zip(own, point.T, strict=True)}
 
     def white(point: np.ndarray, draw: np.ndarray) -> np.ndarray:
-        return np.sqrt(share) * problem.residual_batch(values_at(point, draw), horizon)
+        return np.sqrt(share) * problem.residuals(values_at(point, draw), horizon)
 
     seen = np.flatnonzero(problem.model.markers.valid)
     noise = np.asarray(jax.random.normal(noise_key, (count, len(seen))))

@@ -121,17 +121,15 @@ def test_the_log_likelihood_is_the_sum_of_the_channels_written_down_anew():
     }
 
 
-def test_residuals_of_all_channels_have_one_layout_traced_in_batches_and_taken_apart():
+def test_residuals_of_all_channels_have_one_layout_in_batches_and_taken_apart():
     """JAX returns dictionaries in the order of their keys, and the tension stands before the motor angle."""
     chosen = problem(recording(1), recording(3))
     values = {"reach": 0.1, **SIZES}
     single = {name: jnp.asarray(value) for name, value in values.items()}
-    white = np.asarray(chosen.residuals(single, ROWS))
-    batch = chosen.residual_batch({name: np.array([value]) for name, value in values.items()}, ROWS)
-    np.testing.assert_allclose(white, batch[0], rtol=1e-9)
+    white = chosen.residuals({name: np.array([value]) for name, value in values.items()}, ROWS)[0]
     series = chosen.independent_series(white)
     assert set(series) == {"markers", "tension", "motor_angle"}
-    own = chosen.model.residuals(single, jnp.asarray(chosen.steps_for(ROWS)))
+    own = chosen.model.white(chosen.model.seen(chosen.model.simulate(single), single))
     for name, (part, valid) in series.items():
         np.testing.assert_allclose(part, np.asarray(own[name])[..., : valid.shape[-1]], rtol=1e-9)
 

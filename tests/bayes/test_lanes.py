@@ -21,7 +21,7 @@ def test_rollouts_are_compiled_once_for_densities_residuals_and_predictions():
     problem = CalibrationProblem(model.numpyro(runs), chunk=8)
     values = problem.sample_prior(jax.random.key(0), 5)
     rows, status = problem.row_log_likelihood(values, problem.n_rows)
-    white = problem.residual_batch(values, problem.n_rows)
+    white = problem.residuals(values, problem.n_rows)
     positions = np.asarray(problem.observe(values).position)
     assert not status.any()
     assert problem.model.lanes._rolled._cache_size() == 1

@@ -122,7 +122,7 @@ def test_the_density_of_the_angles_is_that_of_normals_at_new_readings_only():
         assert with_angles[row] - without[row] == pytest.approx(expected, abs=1e-9)
     assert with_angles[0] == without[0]  # when the first row was read is not known
     single = {name: value[0] for name, value in values.items()}
-    residuals = np.asarray(chosen.residuals(single, 60))
+    residuals = chosen.residuals(values, 60)[0]
     count = 2 * 19
     constant = -60 * 3 * np.log(SENT) - count * np.log(0.01) - 0.5 * (180 + count) * np.log(2 * np.pi)
     assert with_angles.sum() == pytest.approx(constant - 0.5 * np.sum(residuals**2), rel=1e-9)

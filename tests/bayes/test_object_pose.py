@@ -151,9 +151,9 @@ def test_the_density_of_the_poses_is_that_of_an_ornstein_uhlenbeck_process_about
     prior = sum(float(p.prior.log_prob(single[p.name])) for p in chosen.model.scopes.parameters)
     assert float(joint) == pytest.approx(rows.sum() + prior, rel=1e-9)  # the numpyro program has the same density
     # Residuals have the same slope as the density; data put in the model's place count as its own do.
-    further = {**single, "slip": jnp.asarray(0.5)}
-    squares = [float(jnp.sum(chosen.residuals(v, 30) ** 2)) for v in (single, further)]
-    there = chosen.row_log_likelihood({**values, "slip": jnp.array([0.5])}, 30)[0][0]
+    further = {**values, "slip": jnp.array([0.5])}
+    squares = [np.sum(chosen.residuals(v, 30) ** 2) for v in (values, further)]
+    there = chosen.row_log_likelihood(further, 30)[0][0]
     assert there.sum() - rows.sum() == pytest.approx(0.5 * (squares[0] - squares[1]), rel=1e-9)
     moved = with_measured(chosen, {**chosen.measured, "object_pose": chosen.measured["object_pose"] + 0.1})
     assert moved.row_log_likelihood(values, 30)[0][0].sum() < rows.sum() - 100.0
@@ -180,14 +180,14 @@ def test_poses_tell_what_the_tip_does_not():
     step = 1e-3
     batch = {name: np.full(3, value) for name, value in TRUTH.items()}
     batch["slip"] = TRUTH["slip"] + np.array([0.0, -step, step])
-    left, below, above = with_measured(chosen, made).residual_batch(batch, 30)
+    left, below, above = with_measured(chosen, made).residuals(batch, 30)
     slope = (above - below) / (2.0 * step)
     deviation = 1.0 / np.linalg.norm(slope)
     # A share of 75 mm, seen to 2 mm, and a turn of 0.37 rad, seen to 0.05 rad: five correlation times are a few looks.
     assert 0.005 < deviation < 0.05
     assert abs(slope @ left) * deviation < 4.0  # Gauss-Newton's step from the truth, in deviations
     assert np.sum(left**2) < 30 * 9 + 5.0 * np.sqrt(2.0 * 30 * 9)  # chi-squared of all that was measured
-    assert np.ptp(plain.residual_batch(batch, 30), axis=0).max() == 0.0
+    assert np.ptp(plain.residuals(batch, 30), axis=0).max() == 0.0
 
 
 def test_what_is_lacking_is_said():

@@ -85,8 +85,7 @@ class LinearGaussian(ProblemDefaults):
         return self._row_density(u, horizon), np.zeros(len(u), dtype=int)
 
     def residuals(self, values, horizon):
-        u = jnp.stack([values[name] for name in self.names])
-        return (self.data[:horizon] - self.design[:horizon] @ u) / self.noise[:horizon]
+        return (self.data[:horizon] - together(values, self.names) @ self.design[:horizon].T) / self.noise[:horizon]
 
     def prefix_log_evidence(self):
         """log p(y[:h]) for h = 1 ... n_rows."""
@@ -117,8 +116,8 @@ class Decay(ProblemDefaults):
     bounds = dict.fromkeys(names, (0.0, np.inf))
     status_names = {1: "diverged"}  # noqa: RUF012
 
-    def __init__(self, n_rows: int = 60, seed: int = 0, fails_above: float = np.inf, traceable: bool = True) -> None:
-        self.n_rows, self.fails_above, self.traceable = n_rows, fails_above, traceable
+    def __init__(self, n_rows: int = 60, seed: int = 0, fails_above: float = np.inf) -> None:
+        self.n_rows, self.fails_above = n_rows, fails_above
         self.time = np.linspace(0.0, 3.0, n_rows)
         self.centre = np.log([1.0, 1.0, 0.1])
         self.spread = np.array([0.7, 0.7, 1.0])
@@ -149,12 +148,8 @@ class Decay(ProblemDefaults):
         return rows, failed.astype(int)
 
     def residuals(self, values, horizon):
-        kind = jnp if self.traceable else np
-        parts = [kind.asarray(values[name]) for name in self.names]
-        if not self.traceable:
-            parts = [float(part) for part in parts]
-        amplitude, rate, noise = parts
-        return (self.data[:horizon] - amplitude * kind.exp(-rate * self.time[:horizon])) / noise
+        amplitude, rate, noise = (np.asarray(values[name])[:, None] for name in self.names)
+        return (self.data[:horizon] - amplitude * np.exp(-rate * self.time[:horizon])) / noise
 
 
 class Touched(LinearGaussian):
@@ -176,8 +171,7 @@ class Touched(LinearGaussian):
         return normal_density(self.data[:horizon], self.fit(u, horizon), self.noise[:horizon])
 
     def residuals(self, values, horizon):
-        u = jnp.stack([values[name] for name in self.names])
-        return (self.data[:horizon] - self.fit(u, horizon)) / self.noise[:horizon]
+        return (self.data[:horizon] - self.fit(together(values, self.names), horizon)) / self.noise[:horizon]
 
 
 class TwoModes(LinearGaussian):
@@ -194,8 +188,8 @@ class TwoModes(LinearGaussian):
         return normal_density(self.data[:horizon], fit, self.noise[:horizon])
 
     def residuals(self, values, horizon):
-        u = jnp.stack([jnp.abs(values["x0"]), *(values[name] for name in self.names[1:])])
-        return (self.data[:horizon] - u[:horizon]) / self.noise[:horizon]
+        u = together({**values, "x0": abs(values["x0"])}, self.names)
+        return (self.data[:horizon] - u[:, :horizon]) / self.noise[:horizon]
 
     def mode_evidence(self):
         """Log evidence of the modes x > 0 and x < 0 of the first row, together and their shares."""
@@ -242,7 +236,7 @@ class Ratio(LinearGaussian):
         return normal_density(self.data[:horizon], fit, self.noise[:horizon])
 
     def residuals(self, values, horizon):
-        fit = jnp.log(values["stiffness"] / values["mass"]) * self.gain[:horizon]
+        fit = np.log(values["stiffness"] / values["mass"])[:, None] * self.gain[:horizon]
         return (self.data[:horizon] - fit) / self.noise[:horizon]
 
     def along_the_ridge(self, mass):
@@ -280,9 +274,9 @@ class Washboard(LinearGaussian):
         return kind(whole).tile(whole[:, None] / self.n_rows, (1, horizon))
 
     def residuals(self, values, horizon):
-        away = jnp.stack([values[name] for name in self.names]) - self.centre
-        parts = [away / self.width, 2.0 * jnp.sqrt(self.ripple) * jnp.sin(jnp.pi * away)]
-        return jnp.sqrt(horizon / self.n_rows) * jnp.concatenate(parts)
+        away = np.asarray(together(values, self.names)) - self.centre
+        parts = [away / self.width, 2.0 * np.sqrt(self.ripple) * np.sin(np.pi * away)]
+        return np.sqrt(horizon / self.n_rows) * np.concatenate(parts, axis=1)
 
     def log_evidence(self):
         away = np.linspace(-4.0, 4.0, 80001)

@@ -31,12 +31,12 @@ def test_a_linear_model_s_draws_are_those_of_the_joint_posterior():
     measured = 1.3 * command + 2.6 + SIGMA * rng.normal(size=ROWS)
     body = {"gain": rng.normal(1.0, 0.3, 3000), "zero": np.full(3000, 2.0)}
 
-    def residual_batch(values, horizon):
+    def residuals(values, horizon):
         zero = (values["zero"] + values["zero_deviation@day"])[:, None]
         return (values["gain"][:, None] * command + zero - measured) / SIGMA
 
     model = SimpleNamespace(markers=SimpleNamespace(valid=np.ones(ROWS, dtype=bool)))
-    problem = SimpleNamespace(model=model, n_rows=ROWS, residual_batch=residual_batch)
+    problem = SimpleNamespace(model=model, n_rows=ROWS, residuals=residuals)
     own = [p for p in space.parameters if p.scope.added_to]
     found = fit_session(problem, body, own, jax.random.key(0))
     design = np.stack([command, np.ones(ROWS)], axis=1) / SIGMA
@@ -70,10 +70,10 @@ def test_coordinates_that_err_together_count_as_fewer():
         truth = SPREAD * rng.normal()
         measured = truth + SIGMA * np.linalg.cholesky(across) @ rng.normal(size=columns)
 
-        def residual_batch(values, horizon, measured=measured):
+        def residuals(values, horizon, measured=measured):
             return (values["zero_deviation@day"][:, None] - measured) / SIGMA
 
-        problem = SimpleNamespace(model=model, n_rows=1, residual_batch=residual_batch)
+        problem = SimpleNamespace(model=model, n_rows=1, residuals=residuals)
         for counted in inside:
             found = fit_session(problem, {"zero": np.zeros(100)}, own, jax.random.key(number), share=counted)
             low, high = np.quantile(found.values["zero_deviation@day"], [0.05, 0.95])

@@ -39,9 +39,9 @@ def test_simulated_data_fit_their_own_truth():
     problem = model.problem(model.recordings("fit"))
     truth, replica, failed = simulate_data_set(problem, jax.random.key(0))
     values = {name: np.array([value]) for name, value in truth.items()}
-    white = replica.residual_batch(jax.tree.map(jax.numpy.asarray, values), problem.n_rows)[0]
+    white = replica.residuals(jax.tree.map(jax.numpy.asarray, values), problem.n_rows)[0]
     assert failed == 0
     assert np.mean(white**2) == pytest.approx(1.0, abs=5.0 * np.sqrt(2.0 / white.size))
     assert replica.fingerprint != problem.fingerprint
-    shorter = replica.residual_batch(jax.tree.map(jax.numpy.asarray, values), 5)[0]
+    shorter = replica.residuals(jax.tree.map(jax.numpy.asarray, values), 5)[0]
     np.testing.assert_allclose(shorter, white[: len(shorter)], atol=1e-9)

@@ -145,7 +145,7 @@ def find_modes(
         chosen: selects from the final optimisations; by default all within `ALTERNATIVE` nats of the best.
 
     Raises:
-        InputError: a problem without residuals whose likelihood JAX cannot differentiate.
+        InputError: a problem without residuals.
         NoLikelihoodError: none of the draws has a positive likelihood.
     """
     horizons, target_at = _targets(problem, config)
@@ -451,10 +451,10 @@ def _targets(problem: Problem, config: LaplaceConfig) -> tuple[tuple[int, ...], 
         raise InputError("this problem has no residuals", where="[inference] method", remedy='use method = "smc"')
     prior = prior_derivatives(problem)
 
-    def by_residuals(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Optimisable:
+    def target_at(horizon: int, ledger: Ledger, u: np.ndarray, noise: np.ndarray | None) -> Optimisable:
         return make_target(problem, horizon, ledger, u, prior, noise)
 
-    return block_boundaries(problem.n_rows, PILOT_PREFIXES if config.pilot_particles else config.blocks), by_residuals
+    return block_boundaries(problem.n_rows, PILOT_PREFIXES if config.pilot_particles else config.blocks), target_at
 
 
 def _affordable_steps(

@@ -21,9 +21,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from rfdropo_bayes.bayes.problem import BatchedResiduals, ResidualProblem
+from rfdropo_bayes.bayes.problem import ResidualProblem
 from rfdropo_bayes.inference.evaluations import Ledger, evaluate_prior, evaluate_rows
 from rfdropo_bayes.inference.modes.optimisation import positive_part
 
@@ -47,8 +47,8 @@ class Target(NamedTuple):
     linearise: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # residuals (m,) and their Jacobian (m, d)
     residuals: Callable[[np.ndarray], np.ndarray]  # residuals (n, m) of a batch (n, d); zero for missing data
     noise: Bool[np.ndarray, " d"]  # coordinates along which the log determinant changes
-    # residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if the Jacobian is
-    # exact
+    # residuals (m,), and their central differences (m, d) along the columns of a matrix (d, d); None if derivatives are
+    # not recomputed
     differences: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None = None
     # gradient of the terms of the log likelihood beside half the sum of squares, whose curvature is neglected; None if
     # these terms depend on noise coordinates only
@@ -119,7 +119,7 @@ def make_target(
     def density(points: np.ndarray) -> np.ndarray:
         return evaluate_prior(problem, points) + likelihood(points)
 
-    residuals_at, linearise, differences = _make_linearise(problem, horizon, ledger, u)
+    residuals_at, linearise, differences = _make_linearise(problem, horizon, ledger)
     if noise is None and len(problem.physical_names) < len(problem.names):
         noise = np.array([name not in problem.physical_names for name in problem.names])
     if noise is None:
@@ -141,27 +141,14 @@ def prior_derivatives(problem: ResidualProblem) -> tuple[Callable, Callable]:
     return (lambda u: np.asarray(gradient(u))), (lambda u: np.asarray(hessian(u)))
 
 
-def _make_linearise(
-    problem: ResidualProblem, horizon: int, ledger: Ledger, u: np.ndarray
-) -> tuple[Callable, Callable, Callable]:
+def _make_linearise(problem: ResidualProblem, horizon: int, ledger: Ledger) -> tuple[Callable, Callable, Callable]:
     """Three functions: residuals of a batch of points, without a charge to the budget; residuals and Jacobian at one
     point, with a charge, by central differences; and `Target.differences`."""
-
-    def residuals(u: Array) -> Any:
-        values = problem.from_unconstrained(u[None])
-        return problem.residuals({name: value[0] for name, value in values.items()}, horizon)
-
-    in_batches = problem.residual_batch if isinstance(problem, BatchedResiduals) else None
     drawn = problem.to_unconstrained(problem.sample_prior(jax.random.key(0), PRIOR_DRAWS))
     width = DIFFERENCE * np.asarray(drawn).std(axis=0)
-    batched = jax.jit(jax.vmap(residuals)) if in_batches is None and _traceable(residuals, u) else None
 
     def at(points: np.ndarray) -> np.ndarray:
-        if in_batches:
-            return np.asarray(in_batches(problem.from_unconstrained(jnp.asarray(points)), horizon))
-        if batched:
-            return np.asarray(batched(jnp.asarray(points)))
-        return np.stack([np.asarray(residuals(jnp.asarray(point))) for point in points])
+        return np.asarray(problem.residuals(problem.from_unconstrained(jnp.asarray(points)), horizon))
 
     def differences(u: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ledger.charge(problem, 2 * len(u) + 1, horizon)
@@ -174,15 +161,6 @@ def _make_linearise(
         return residual, changes / width
 
     return at, central, differences
-
-
-def _traceable(residuals: Callable, u: np.ndarray) -> bool:
-    """Whether JAX can trace the residuals; plain NumPy has no trace."""
-    try:
-        jax.eval_shape(residuals, jnp.asarray(u))
-    except (jax.errors.JAXTypeError, TypeError, ValueError, NotImplementedError):
-        return False
-    return True
 
 
 def _noise_coordinates(determinant: Callable, u: np.ndarray) -> np.ndarray:

@@ -87,7 +87,7 @@ class DaysApart(ProblemDefaults):
         self.to_unconstrained, self.from_unconstrained = self.space.to_unconstrained, self.space.from_unconstrained
 
     def residuals(self, values, horizon):
-        return jnp.stack([values["zero"] + values[f"zero_deviation@{day}"] for day in "ab"])
+        return np.stack([values["zero"] + values[f"zero_deviation@{day}"] for day in "ab"], axis=1)
 
     def row_log_likelihood(self, values, horizon):
         off = np.stack([np.asarray(values["zero"] + values[f"zero_deviation@{day}"]) for day in "ab"])

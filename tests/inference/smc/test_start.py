@@ -202,10 +202,10 @@ def test_the_mixture_is_a_density_that_its_draws_have():
 
 @pytest.mark.slow
 def test_optimisations_keep_their_budget():
-    problem = Decay(n_rows=40, traceable=False)
+    problem = Decay(n_rows=40)
     result = methods.run(problem, "laplace", {"rollouts": 120, "prior_draws": 16}, KEY)
     assert result.trace[-1]["rollouts"] <= 120  # normal approximations of the optima come on top
-    free = methods.run(Decay(n_rows=40, traceable=False), "laplace", {"prior_draws": 16}, KEY)
+    free = methods.run(Decay(n_rows=40), "laplace", {"prior_draws": 16}, KEY)
     assert free.rollouts > result.rollouts
 
 
