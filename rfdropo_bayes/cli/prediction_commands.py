@@ -47,11 +47,12 @@ def predict(
     overrides: Overrides = None,
 ) -> None:
     """Predict the motion under new commands. Writes mean, 50 and 90 % bands as NetCDF and CSV (m, base frame)."""
+    named = "--from" if fit else "DIR"
     if experiment.is_dir():
         fit, experiment = fit or experiment, experiment / "config.toml"
     if fit is None:
         raise InputError("no calibration was named", where="predict", remedy="add --from, or give a run's folder")
-    see_calibration(fit, "--from")
+    see_calibration(fit, named)
     look_through(experiment, overrides or [])
     check_folder(out, "predict", overwrite=overwrite)
     from rfdropo_bayes.inference.progress import say_step

@@ -141,18 +141,23 @@ def recognised(trajectory: Trajectory) -> Beginning:
     errors = beginning_errors(trajectory)
     if errors is None:
         return Beginning(UNDECIDED, "assumed: the first rows do not decide")
-    first, zero = 1e3 * errors["first"], 1e3 * errors["zero"]
+    (first, first_later), (zero, zero_later) = (1e3 * np.array(errors[rule]) for rule in ("first", "zero"))
     evidence = (
         f"the first rows differ by {first:.2g} mm from a start at the first command, by {zero:.2g} mm from one at zero"
     )
-    if zero < CLEARLY * first:
+    if _decides(zero, first, zero_later):
         return Beginning("zero", f"recognised: {evidence}")
-    if first < CLEARLY * zero:
+    if _decides(first, zero, first_later):
         return Beginning("first", f"recognised: {evidence}")
     moved = None if far_from_zero(trajectory.command) else moved_while_held(trajectory)
     if moved is not None:
         return Beginning("zero", f"recognised: it moves by {1e3 * moved:.2g} mm while the first command is held")
     return Beginning(UNDECIDED, f"assumed: {evidence}, which does not decide")
+
+
+def _decides(smaller: float, larger: float, later: float) -> bool:
+    """Whether the larger of two errors in the first rows shows a wrong start, beside a linear robot's in later rows."""
+    return smaller < CLEARLY * larger and larger**2 - smaller**2 > (CLEARLY * later) ** 2
 
 
 def far_from_zero(command: Float[np.ndarray, "command channel"]) -> bool:
@@ -178,8 +183,9 @@ def moved_while_held(trajectory: Trajectory) -> float | None:
     return moved if moved > max(MOVES * np.nanquantile(steps, STILL), PART * way) else None
 
 
-def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
-    """Root mean square error [m] in the first rows of a linear robot that starts at the first command, and at zero.
+def beginning_errors(trajectory: Trajectory) -> dict[str, tuple[float, float]] | None:
+    """Root mean square errors [m] in the first rows, and in later rows, of a linear robot that starts at the first
+    command, and at zero.
 
     For each start, the dead time and lag are chosen for the least error of a regression over the rows used. None if
     there are fewer rows than unknowns, or if the data cannot distinguish the cases.
@@ -210,7 +216,11 @@ def beginning_errors(trajectory: Trajectory) -> dict[str, float] | None:
     end = max(*(settled for _, settled, _ in best.values()), time[FEWEST_ROWS - 1])
     early = time <= end
     points = position.shape[1] / 3.0
-    return {rule: float(np.sqrt(square[early].mean() / points)) for rule, (_, _, square) in best.items()}
+
+    def size(square: Float[np.ndarray, " few"]) -> float:
+        return float(np.sqrt(square.mean() / points)) if len(square) else 0.0
+
+    return {rule: (size(square[early]), size(square[~early])) for rule, (_, _, square) in best.items()}
 
 
 def _changes(trajectory: Trajectory) -> bool:

@@ -39,7 +39,7 @@ from rfdropo_bayes.discrepancy.remainder import Remainder, describe_remainder
 from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
 from rfdropo_bayes.discrepancy.verdict import DESCRIBED, NEGLIGIBLE, NO_VERDICT, PARTLY, UNEXPLAINED, decide, negligible
 
-BASE, CAUSES = "the fit of the base model", "naming causes"
+BASE, CAUSES, FURTHER = "the fit of the base model", "naming causes", "further causes"
 GAIN, LAWS = "the gain on unseen recordings", "laws at ports"
 
 
@@ -72,12 +72,16 @@ class Results:
 
     @property
     def unfinished(self) -> tuple[str, ...]:
-        """Unfinished parts, in words."""
+        """Unfinished parts, in words; a stopped audit measures the gain of the causes that it has named."""
         waiting = () if self.named is None else self.named.waiting
-        parts = [BASE, CAUSES, *([GAIN] if self.named is None or self.named.steps else [])]
+        measured = self.kept is not None and self.kept.held_out is not None
+        some = any(each.steps for each in (self.named, self.kept and self.kept.named) if each)
+        parts = [BASE, CAUSES, *([GAIN] if not measured and (self.named is None or self.named.steps) else [])]
         unfinished = [part for part in parts if part not in self.ended]
         if waiting:
-            unfinished[unfinished.index(CAUSES)] = f"refits with {', '.join(waiting)}, and further causes"
+            unfinished[unfinished.index(CAUSES)] = f"refits with {', '.join(waiting)}, and {FURTHER}"
+        elif CAUSES in unfinished and some:
+            unfinished[unfinished.index(CAUSES)] = FURTHER
         asks = self.problem.ports is not None and self.problem.compared is None
         return (*unfinished, *([LAWS] if asks and LAWS not in self.ended else []))
 
@@ -349,7 +353,7 @@ def conclude(results: Results, report: Callable[[str], None] = lambda line: None
         verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
     draws = sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds)
     rollouts = fit_target.forward.rollouts + (finer.rollouts if finer else 0)
-    why, unfinished = (clock.why, results.unfinished) if stopped else ("", ())
+    why, unfinished = (clock.why, replace(results, kept=kept).unfinished) if stopped else ("", ())
     return Answer(
         verdict,
         problem,
@@ -417,7 +421,7 @@ def _verdict(kept: Kept, problem: AuditProblem, *, ended: bool, small: bool) -> 
     verdict = decide(rules, named.test_series[0].omnibus.p, last, members, gain, noise.doubtful, small)
     if not named.fit.converged:  # clearly supported effects are found nevertheless
         return PARTLY if gain is not None and gain.clear else NO_VERDICT
-    return verdict if ended or named.steps or verdict != UNEXPLAINED else NO_VERDICT
+    return verdict if ended or verdict != UNEXPLAINED else NO_VERDICT
 
 
 def _named(begun: Named) -> Iterator[Named]:

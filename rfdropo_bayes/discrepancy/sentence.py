@@ -172,6 +172,8 @@ def _words(answer: Answer, findings: Sequence[dict[str, Any]]) -> str:
     elif gain.worse:
         worse = "unseen recordings are predicted worse"
         head = f"Unexplained: with the best of the library, {named}, {worse} ({_errors(gain)})"
+    elif answer.verdict == NO_VERDICT:
+        head = f"No verdict: the best so far, {named}, explains {share}"
     elif answer.verdict == UNEXPLAINED:
         head = f"Unexplained: the best of the library, {named}, explains only {share}"
     elif answer.verdict in (EXPLAINED, "equivalent"):
@@ -335,8 +337,14 @@ def _pattern(answer: Answer) -> str:
     """Clause about an extended model that fails the joint test."""
     rules, last = answer.problem.rules, answer.test_series[-1].omnibus.p
     words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
-    sure = last <= rules.level and not _only_noise(answer)
-    return f"{words}: something else is at work" if sure else words
+    if last > rules.level or _only_noise(answer):
+        return words
+    gain, numerical = answer.validation.gain, answer.numerical
+    if answer.target.noise.source == REPEATS and gain is not None and numerical is not None:
+        beyond = gain.rmse_extended**2 - noise_distance(answer.target.noise.first) ** 2
+        if beyond <= numerical**2:
+            return f"{words}, no larger than the error of time step and elements ({1e3 * numerical:.2g} mm)"
+    return f"{words}: something else is at work"
 
 
 def _remains(answer: Answer) -> str:

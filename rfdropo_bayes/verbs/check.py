@@ -189,7 +189,11 @@ def _say_motion(
         if fit is not None:
             report.lines += rest_lines(fit)
             report.notes += rest_notes(fit) if rests else []
-            if not report.doubts and compared.agreement < AGREEING and (words := misread(fit)) is not None:
+            if (
+                not report.doubts
+                and compared.agreement < AGREEING
+                and (words := misread(fit, moves=not rests)) is not None
+            ):
                 report.doubts.append(words)
             report.files.append(out / "at_rest.png")
             rest_figure(fit).savefig(report.files[-1])

@@ -47,24 +47,43 @@ def last_third(recordings: Sequence[int]) -> Sequence[int]:
     return recordings[-max(1, len(recordings) // 3) :] if len(recordings) > 1 else ()
 
 
+def unseen_third(recordings: Sequence[int], repeats: Sequence[Sequence[int]]) -> Sequence[int]:
+    """As `last_third`, without repeats of fitted commands: repeats are fitted or tested together, and whoever has too
+    many of them for a test is fitted. If all recordings are repeats, the last third of them.
+    """
+    families = {k: [member for member in group if member in recordings] for group in repeats for k in group}
+    chosen: list[int] = []
+    for k in reversed(recordings):
+        if k not in chosen and len(chosen) + len(families[k]) <= max(1, len(recordings) // 3):
+            chosen += families[k]
+    return sorted(chosen) if chosen and len(recordings) > 1 else last_third(recordings)
+
+
 def pieces_of(
-    counts: Sequence[int], days: Mapping[str, Sequence[int]], *, rests: bool = False, timed: bool = True, kept: int = 0
+    counts: Sequence[int],
+    days: Mapping[str, Sequence[int]],
+    repeats: Sequence[Sequence[int]],
+    *,
+    rests: bool = False,
+    timed: bool = True,
+    kept: int = 0,
 ) -> list[Piece]:
-    """Entries of fit and test: of each day the last third is the test, of its recordings or of its single recording;
-    or the last ``kept`` recordings.
+    """Entries of fit and test: of each day the last third is the test, of its recordings (see `unseen_third`) or of its
+    single recording; or the last ``kept`` recordings.
 
     Poses without times have no order, so rows between the fitted ones are the test if there are enough.
 
     Args:
         counts: rows of every recording.
         days: numbers of the recordings of each day; empty for one day.
+        repeats: numbers of the recordings of each command sequence.
         rests: whether every row is an equilibrium; a fit may then leave out rows.
         timed: whether rows have times.
         kept: number of recordings that were named for the test.
     """
     groups = list(days.values()) or [range(len(counts))]
     alone = [group[0] for group in groups if not kept and len(group) == 1 and counts[group[0]] >= FEWEST_ROWS]
-    tested = set(range(len(counts))[-kept:] if kept else (k for group in groups for k in last_third(group)))
+    tested = set(range(len(counts))[-kept:] if kept else (k for group in groups for k in unseen_third(group, repeats)))
     fitted = sum(
         (2 * count // 3 if number in alone and timed else count)
         for number, count in enumerate(counts)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rfdropo_bayes.data import Trajectory, lerobot, load_recordings, motive_csv, rosbag
+from rfdropo_bayes.data import Trajectory, group_repeats, lerobot, load_recordings, motive_csv, rosbag
 from rfdropo_bayes.data.counters import Column, Motion, quoted_key, read_on, turns_of, wraps_of
 from rfdropo_bayes.data.mapped_formats import recognised_format
 from rfdropo_bayes.data.named_columns import COUNTS, METRES, ROWS
@@ -257,8 +257,9 @@ def write_first_files(
     timed = guess.time is not None or guess.sample_time is not None
     frame = [f"{line}  # ASSUMED: found from the first row" for line in _frame(plain, made, guess)]
     slow = slow_motion(made, first) if timed else NO_MOTION
+    counts = [len(run.time) for run in runs]
     pieces = (
-        pieces_of([len(run.time) for run in runs], days, rests=slow is not None, timed=timed, kept=kept)
+        pieces_of(counts, days, group_repeats(runs), rests=slow is not None, timed=timed, kept=kept)
         if len(runs) == len(recordings)
         else None
     )

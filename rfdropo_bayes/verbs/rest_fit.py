@@ -288,19 +288,22 @@ def rest_lines(fit: RestFit) -> list[tuple[str, str]]:
 
 def rest_notes(fit: RestFit) -> list[str]:
     """Notes on residuals at rest: worse than without physics, a drift, or hysteresis."""
-    notes = [] if (words := misread(fit)) is None else [words]
+    notes = [] if (words := misread(fit, moves=False)) is None else [words]
     return [*notes, *_drifts(fit), *_by_way(fit)]
 
 
-def misread(fit: RestFit) -> str | None:
-    """What is likely wrong with a recording that a map without physics explains better; None if it does not."""
+def misread(fit: RestFit, *, moves: bool) -> str | None:
+    """What is likely wrong with a recording that a map without physics explains better; None if it does not. In motion
+    the map, which knows earlier commands, may follow a delay and a swing.
+    """
     best = min((name for name in fit.unseen if name != OWN), key=lambda name: fit.unseen[name])
     if not fit.tested or fit.unseen[OWN] <= fit.unseen[best]:  # regressions fit their own rows better
         return None
     cause = (
         "a unit, an order of commands or markers, a length or a frame is likely wrong"
         if fit.unseen[OWN] > MISREAD * fit.unseen[best]
-        else "friction, stretch of cables or another effect is missing, or some cables end or run elsewhere"
+        else f"{'delay, swing, ' if moves else ''}friction, stretch of cables or another effect is missing, or some "
+        "cables end or run elsewhere"
     )
     return (
         f"a fitted robot at rest is off by {_millimetres(fit.unseen[OWN])} mm, the {best} without any physics by "

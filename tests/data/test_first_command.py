@@ -16,7 +16,7 @@ from rfdropo_bayes.data import (
     load_unseen,
     read_asl_csv,
 )
-from rfdropo_bayes.data.first_command import begun_alike, begun_from, recognised
+from rfdropo_bayes.data.first_command import _decides, begun_alike, begun_from, recognised
 from rfdropo_bayes.errors import InputError
 
 CHANNELS, PERIOD = 3, 0.05
@@ -195,3 +195,10 @@ def test_motors_show_where_they_stand_before_the_first_command(asl_tables, write
     assert first_row_only(found).motor_angle is None
     given = load_recordings(DataSpec.parse({"format": "asl-csv", "fit": [entry], "initial_command": "zero"}), tmp_path)
     assert not given[0].initial_command.any()
+
+
+def test_a_motion_that_no_linear_robot_follows_does_not_show_its_start():
+    """The first rows favour a start at zero by 2.3 against 3.3 mm, as in servos far from zero; later rows are missed by
+    9.8 mm anyway."""
+    assert _decides(2.3, 3.3, 0.5)
+    assert not _decides(2.3, 3.3, 9.8)

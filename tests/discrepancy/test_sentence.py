@@ -50,6 +50,24 @@ def test_nothing_else_is_at_work_where_all_that_remains_is_noise(answer):
     assert "of it noise" in more
 
 
+def test_a_rest_as_small_as_the_error_of_the_simulation_is_no_further_cause(answer):
+    """Errors 10 % above the noise leave .46 of it, in quadrature."""
+    floor = 3**0.5 * NOISE
+    above = replace(answer.validation, gain=replace(answer.validation.gain, rmse_extended=1.1 * floor))
+    fine, coarse = (said(replace(answer, numerical=k * floor, validation=above)) for k in (0.4, 0.5))
+    assert "something else is at work" in fine
+    assert "no larger than the error of time step and elements" in coarse
+    assert "something else" not in coarse
+
+
+def test_an_audit_that_was_stopped_before_a_sufficient_cause_has_no_verdict(answer):
+    words = said(replace(answer, verdict="no_verdict"))
+    assert words.startswith("No verdict: the best so far, ")
+    assert "Unexplained" not in words
+    stopped = next_experiment(replace(answer, verdict="no_verdict"))
+    assert stopped["sentence"] == "Nothing yet: raise [audit] minutes, and go on with --resume."
+
+
 def test_the_page_shows_the_markers_that_all_recordings_have(answer):
     """The first recording has one more, and in another order than the robot."""
     first, *rest = answer.problem.trajectories

@@ -37,16 +37,27 @@ def test_the_group_of_a_day_holds_no_other_day(names):
     assert list(gather_groups(names, groups).values()) == [(name,) for name in names]
 
 
+SINGLE = [[k] for k in range(7)]  # no command sequence is repeated
+
+
+def test_a_repeat_of_fitted_commands_is_no_test():
+    """Recordings 0, 2 and 4 of six are repeats: 3 and 5 are the test. Of four repeats the last is."""
+    found = pieces_of([90] * 6, {}, [[0, 2, 4], [1], [3], [5]])
+    assert [piece.file for piece in found if piece.tested] == [3, 5]
+    assert [piece.tested for piece in pieces_of([90] * 4, {}, [[0, 1, 2, 3]])] == [False] * 3 + [True]
+    assert [piece.tested for piece in pieces_of([90] * 6, {}, [[0, 1], [2, 3], [4, 5]])] == [False] * 4 + [True] * 2
+
+
 def test_the_last_third_is_kept_for_a_test_unless_there_are_few_rows():
-    assert pieces_of([90], {}) == [Piece(0, {"rows": [0, 59]}, False), Piece(0, {"rows": [60, 89]}, True)]
-    assert pieces_of([40], {}) == [Piece(0, {}, False)]
-    assert pieces_of([90, 40], {}) == [Piece(0, {}, False), Piece(1, {}, True)]
-    assert [piece.tested for piece in pieces_of([90] * 7, {})] == [False] * 5 + [True] * 2
+    assert pieces_of([90], {}, SINGLE) == [Piece(0, {"rows": [0, 59]}, False), Piece(0, {"rows": [60, 89]}, True)]
+    assert pieces_of([40], {}, SINGLE) == [Piece(0, {}, False)]
+    assert pieces_of([90, 40], {}, SINGLE) == [Piece(0, {}, False), Piece(1, {}, True)]
+    assert [piece.tested for piece in pieces_of([90] * 7, {}, SINGLE)] == [False] * 5 + [True] * 2
 
 
 def test_every_day_is_fitted_and_tested():
     days = {"mon": [0, 1], "wed": [2], "fri": [3]}
-    assert pieces_of([90, 90, 90, 40], days) == [
+    assert pieces_of([90, 90, 90, 40], days, SINGLE) == [
         Piece(0, {}, False),
         Piece(1, {}, True),
         Piece(2, {"rows": [0, 59]}, False),
@@ -57,11 +68,11 @@ def test_every_day_is_fitted_and_tested():
 
 def test_of_many_rows_at_rest_a_fit_takes_some():
     rows = 12 * ROWS_AT_REST
-    pieces, cut = partial(pieces_of, [rows], {}), 8 * ROWS_AT_REST
+    pieces, cut = partial(pieces_of, [rows], {}, SINGLE), 8 * ROWS_AT_REST
     fitted, tested = pieces()
     assert (fitted.rows, tested.rows) == ({"rows": [0, cut - 1]}, {"rows": [cut, rows - 1]})
     assert pieces(rests=True)[0].rows == {"rows": [0, cut - 1], "every": 8}
     untimed = pieces(rests=True, timed=False)
     assert [piece.rows for piece in untimed] == [{"rows": [first, rows - 1], "every": 12} for first in (0, 6)]
-    several = pieces_of([rows] * 3, {}, rests=True)
+    several = pieces_of([rows] * 3, {}, SINGLE, rests=True)
     assert [piece.rows for piece in several] == [{"every": 24}, {"every": 24}, {}]
