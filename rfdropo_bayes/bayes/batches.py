@@ -40,19 +40,23 @@ def in_chunks(
     Args:
         function: maps a tree of arrays to a tree of arrays.
         given: the tree.
-        sizes: chunk sizes, ascending. All chunks but the last have the largest size; the last is padded to the smallest
-            sufficient size. The padding repeats the last entry.
+        sizes: chunk sizes, ascending. A chunk has the smallest sufficient size, padded by repeats of the last entry, or
+            the largest; if it would be padding for a half, the next smaller size is filled first.
         before: function called before every chunk; may raise an exception.
         after: called with the number of entries after every chunk.
     """
-    count, parts = len(jax.tree.leaves(given)[0]), []
-    for start in range(0, count, sizes[-1]):
+    count, start, parts = len(jax.tree.leaves(given)[0]), 0, []
+    while start < count:
         before()
-        remaining = min(count - start, sizes[-1])
-        index = np.minimum(np.arange(start, start + next(size for size in sizes if size >= remaining)), count - 1)
+        left = count - start
+        size = next((size for size in sizes if size >= left), sizes[-1])
+        filled = [smaller for smaller in sizes if smaller <= left <= size // 2]
+        size = filled[-1] if filled else size
+        index = np.minimum(np.arange(start, start + size), count - 1)
         chunk = jax.tree.map(lambda array, index=index: np.asarray(array)[index], given)
         parts.append(jax.device_get(function(chunk)))
-        after(remaining)
+        after(min(size, left))
+        start += size
     return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:count], *parts)
 
 

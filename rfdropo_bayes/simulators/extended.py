@@ -171,9 +171,14 @@ class ExtendedSimulator:
             seen = jnp.isfinite(self.measured(values, position, time, meanwhile)).all(axis=(1, 2))
             return jnp.all(seen | ~wanted)
 
-        later = jnp.concatenate([jnp.zeros(1, int), 2 ** jnp.arange(max(rows - 1, 1).bit_length() + 1)])
-        enough = jax.vmap(suffices)(later)
-        found = jnp.where(enough.any(), later[jnp.argmax(enough)], rows)
+        def doubled(tried: tuple[Array, Array]) -> tuple[Array, Array]:
+            later = jnp.maximum(2 * tried[0], 1)
+            return later, suffices(later)
+
+        # Almost always no later row is needed: a loop asks once, all distances at once would take most of a rollout.
+        none = jnp.asarray(0)
+        later, enough = jax.lax.while_loop(lambda tried: ~tried[1] & (tried[0] < rows), doubled, (none, suffices(none)))
+        found = jnp.where(enough, later, rows)
         last = jnp.clip(wanted.sum() + found - 1, 0, rows - 1)
         return jnp.where(found > 0, jnp.maximum(steps, end[last]), steps)
 
