@@ -41,7 +41,7 @@ COMMANDS = (
     "rfdropo check finger/experiment.toml",
     "rfdropo calibrate finger/experiment.toml --set inference.method=laplace --out runs/arm",
     "rfdropo audit finger/experiment.toml --from runs/arm --out runs/audit --set audit.minutes=300",
-    "rfdropo calibrate runs/audit/extended.toml --set inference.method=laplace --out runs/mended",
+    "rfdropo calibrate runs/audit/extended.toml --from runs/audit --set inference.method=laplace --out runs/mended",
     "rfdropo predict runs/mended --commands data/trial_03.csv --out runs/next",
 )
 

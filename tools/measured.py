@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -56,12 +56,9 @@ def days() -> dict[str, dict[float, Mapping[str, Any]]]:
     return found
 
 
-def audits(*ledgers: str, seeds: Sequence[int] = ()) -> dict[str, Mapping[str, Any]]:
-    """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``); of some
-    seeds if they are given.
-    """
-    every = [line for ledger in ledgers for line in read_lines(REPORTS / ledger)]
-    lines = [line for line in every if not seeds or line["job"]["seed"] in seeds]
+def audits(*ledgers: str) -> dict[str, Mapping[str, Any]]:
+    """Share of audits with the right answer by condition, and of 90 % intervals that hold the size (``sizes``)."""
+    lines = [line for ledger in ledgers for line in read_lines(REPORTS / ledger)]
     right: Mapping[str, Callable[[Mapping[str, Any]], bool]] = {
         "null": lambda result: result["verdict"] == "no_discrepancy",
         "removed": lambda result: result["verdict"] not in ("explained", "equivalent"),
@@ -107,7 +104,9 @@ def strangers(kind: str) -> dict[str, Mapping[str, Any]]:
 
 def sizes() -> Mapping[str, Any]:
     """Share of 90 % intervals that hold the size, given the right cause."""
-    learnt = [size for line in read_lines(REPORTS / "size_coverage" / "rod.jsonl") for size in line.get("sizes", [])]
+    lines = read_lines(REPORTS / "size_coverage" / "rod.jsonl")
+    usual = [line for line in lines if (line["made"], line["noise"]) == ("finer", "repeats")]
+    learnt = [size for line in usual for size in line.get("sizes", [])]
     return counted(sum(abs(size["deviations"]) <= 1.645 for size in learnt), len(learnt))
 
 
@@ -158,8 +157,7 @@ def page() -> str:
         days=days(),
         asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
-        motion=audits("audit_power/unknown_scale/datasets.jsonl", "audit_power/visible_steps/datasets.jsonl"),
-        today=audits("audit_power/visible_steps/datasets.jsonl", seeds=(5008, 5009)),
+        motion=audits("audit_power/level/datasets.jsonl"),
         laws=laws(),
         strangers={kind: strangers(kind) for kind in ("motion", "at_rest")},
         sizes=sizes(),

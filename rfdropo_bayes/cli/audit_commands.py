@@ -47,6 +47,7 @@ def audit(
     from rfdropo_bayes.discrepancy.deadline import INTERRUPT
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.audit import audit as ask
+    from rfdropo_bayes.verbs.calibrate import OPTIMISING
 
     result = ask(
         Model.read(experiment, overrides),
@@ -57,7 +58,7 @@ def audit(
         overwrite=overwrite,
         show=True,
     )
-    show_audit(result.content, folder)
+    show_audit(result.content, folder, starts=result.extended.settings.inference.method in OPTIMISING)
     if result.content["stopped"] == INTERRUPT:
         raise Interrupted(str(folder), "--resume")
     if result.content["stopped"]:

@@ -69,12 +69,14 @@ def calibrate(
     overwrite: Overwrite = False,
     fit: Annotated[
         Path | None,
-        typer.Option("--from", help="folder of an earlier calibration of this robot, at which optimisations start"),
+        typer.Option(
+            "--from", help="folder of an earlier calibration or audit of this robot, at which optimisations start"
+        ),
     ] = None,
     overrides: Overrides = None,
 ) -> None:
     """Fit the simulator to recordings. Writes posterior.nc, summary.json and report.html."""
-    see_calibration(fit, "--from")
+    see_calibration(fit, "--from", audit=True)
     folder = folder_for("calibrate", experiment, out, overrides, resume=resume, overwrite=overwrite)
     from rfdropo_bayes.model.model import Model
     from rfdropo_bayes.verbs.calibrate import calibrate as run_fit

@@ -69,13 +69,15 @@ def experiment_name(experiment: Path) -> str:
     return folder if experiment.stem == "experiment" else f"{folder}_{experiment.stem}"
 
 
-def see_calibration(folder: Path | None, option: str) -> None:
-    """See that a folder holds a finished calibration, before anything heavy is imported.
+def see_calibration(folder: Path | None, option: str, *, audit: bool = False) -> None:
+    """See that a folder holds a finished calibration, or an ``audit`` if that will do, before anything heavy is
+    imported.
 
     Raises:
         InputError: it does not.
     """
-    if folder is not None and not (folder / "posterior.nc").is_file():
+    wanted = ("posterior.nc", *(["audit.json"] if audit else []))
+    if folder is not None and not any((folder / name).is_file() for name in wanted):
         raise InputError(
             f"{folder} holds no posterior.nc", where=option, remedy="name the folder of a finished rfdropo calibrate"
         )

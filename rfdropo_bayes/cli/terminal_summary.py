@@ -62,8 +62,10 @@ def show_calibration(calibration: Calibration, experiment: Path | None = None) -
     console.print(f"report: {report}", soft_wrap=True)
 
 
-def show_audit(content: Mapping[str, Any], folder: Path) -> None:
-    """Print the result of an audit; ``content`` is of audit.json."""
+def show_audit(content: Mapping[str, Any], folder: Path, *, starts: bool) -> None:
+    """Print the result of an audit: ``content`` of audit.json. With ``starts`` the calibration that is proposed starts
+    from it.
+    """
     from rfdropo_bayes.report.sentences import sentences
 
     console = _console()
@@ -83,7 +85,8 @@ def show_audit(content: Mapping[str, Any], folder: Path) -> None:
         console.print(_parameters(rows[:MOST_ROWS]))
     console.print(f"next: {content['next_experiment']['sentence']}", soft_wrap=True)
     if content["adopted"]:
-        again = shlex.join(["rfdropo", "calibrate", str(folder / "extended.toml"), "--out", "OUT"])
+        start = ["--from", str(folder)] if starts else []
+        again = shlex.join(["rfdropo", "calibrate", str(folder / "extended.toml"), *start, "--out", "OUT"])
         console.print(f"then: {again}", soft_wrap=True)
     console.print(f"report: {folder / 'report.html'}; extended model: {folder / 'extended.toml'}", soft_wrap=True)
 

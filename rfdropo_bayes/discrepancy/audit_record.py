@@ -101,6 +101,7 @@ def record(
         },
         "where": _where(answer),
         "cautions": [caution.as_dict() for caution in (*doubts, *answer.priors)],
+        "optimum": _optimum(answer),
         "base_parameters": {
             coordinates.names[i]: coordinates.named(base_x)[coordinates.names[i]] for i in answer.base.free
         },
@@ -116,6 +117,18 @@ def record(
         "data_sha256": data_sha256,
         "schema_version": SCHEMA_VERSION,
     }
+
+
+def _optimum(answer: Answer) -> dict[str, dict[str, float]]:
+    """Values of the extended model by parameter and owner, of the base model if no effect was adopted: optimisations of
+    a calibration may start there.
+    """
+    coordinates, fit = answer.problem.coordinates, answer.extended if answer.adopted else answer.base
+    values, found = coordinates.named(fit.x), dict[str, dict[str, float]]()
+    for i in fit.free:
+        parameter = coordinates.space.parameters[i]
+        found.setdefault(parameter.spec.name, {})[parameter.scope.owner] = values[coordinates.names[i]]
+    return found
 
 
 def _noise(answer: Answer) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from scipy.stats import norm, rankdata
 
 DIRECTED = "candidates"  # the statistic that is the largest score of any candidate
-# Share of the level that this statistic gets. Of 24 effects of rho .15 all have a p-value of at most .015 by it, and
-# six have one of at most .005 by another statistic.
+# Share of the level that this statistic gets. Of 75 effects of rho .15 it shows 72 at its share of 2 %, the others show
+# 15 at theirs, and none besides.
 SHARE = 0.75
 BLOCK = 10  # rows
 LAGS = 10

@@ -67,7 +67,9 @@ from rfdropo_bayes.report.object_scores import score_objects
 from rfdropo_bayes.report.residuals import ResidualCheck, check_residuals, residual_cautions
 from rfdropo_bayes.report.run_files import POSTERIOR, SUMMARY
 from rfdropo_bayes.report.summary import read_summary
+from rfdropo_bayes.results.audited import AUDIT, Audit
 from rfdropo_bayes.results.calibrated import Calibration
+from rfdropo_bayes.results.load import load
 from rfdropo_bayes.robots import Robot, robot_shape
 from rfdropo_bayes.robots.robot import implausible_values
 from rfdropo_bayes.simulators.robot_simulator import RobotSimulator
@@ -98,7 +100,7 @@ def calibrate(
     test: Sequence[Trajectory] | None = None,
     seed: int | None = None,
     out: Path | str | None = None,
-    fit: Calibration | Path | None = None,
+    fit: Calibration | Audit | Path | None = None,
     resume: bool = False,
     overwrite: bool = False,
     show: bool | None = None,
@@ -113,7 +115,8 @@ def calibrate(
         seed: seed of all random numbers; 0 without a file. The same seed gives the same draws.
         out: folder for posterior.nc, summary.json, report.html and checkpoints; None writes nothing.
         fit: an earlier calibration of the same robot, or its folder, perhaps with fewer mechanisms or other recordings:
-            optimisations start from its optimum and draws. Parameters and data of the fit do not change.
+            optimisations start from its optimum and draws. Or an audit, or its folder: they start from the values of
+            its extended model. Parameters and data of the fit do not change.
         resume: continue from the checkpoint of an interrupted run of the same experiment in ``out``.
         overwrite: replace an earlier run in ``out``.
         show: whether to show progress, see `Progress`.
@@ -201,8 +204,8 @@ def _fit(asked: Fitting, out: Path | None, text: str, *, resume: bool, show: boo
     return Calibration(record, build_summary(record, facts), text, model, out)
 
 
-def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner | None:
-    """Starts of optimisations from an earlier calibration or its folder; None without it.
+def earlier_draws(fit: Calibration | Audit | Path | None, method: str) -> DrawsByOwner | None:
+    """Starts of optimisations from an earlier calibration or audit, or its folder; None without it.
 
     The first row is its optimum, if known, which is repeated as often as there are draws: in nonlinear problems with
     many parameters a draw may fit far worse than the optimum.
@@ -218,6 +221,13 @@ def earlier_draws(fit: Calibration | Path | None, method: str) -> DrawsByOwner |
             where="--from",
             remedy=f"leave it out, or use one of {', '.join(OPTIMISING)}",
         )
+    if isinstance(fit, Path) and (fit / AUDIT).is_file() and not (fit / POSTERIOR).is_file():
+        fit = load(fit)
+    if isinstance(fit, Audit):
+        if "optimum" not in fit.content:
+            raise InputError("this audit has no optimum", where="--from", remedy="audit again")
+        values = fit.content["optimum"].items()
+        return {name: {owner: np.array([value]) for owner, value in own.items()} for name, own in values}
     if isinstance(fit, Calibration):
         record, content = fit.record, fit.content
     else:

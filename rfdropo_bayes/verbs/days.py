@@ -48,8 +48,8 @@ def last_third(recordings: Sequence[int]) -> Sequence[int]:
 
 
 def unseen_third(recordings: Sequence[int], repeats: Sequence[Sequence[int]]) -> Sequence[int]:
-    """As `last_third`, without repeats of fitted commands: repeats are fitted or tested together, and whoever has too
-    many of them for a test is fitted. If all recordings are repeats, the last third of them.
+    """As `last_third`, without repeats of fitted commands: repeats are fitted or tested together, and a sequence with
+    too many repeats for a test is fitted. If all recordings are repeats, the last third of them.
     """
     families = {k: [member for member in group if member in recordings] for group in repeats for k in group}
     chosen: list[int] = []

@@ -22,11 +22,12 @@ def test_an_audit_is_shown_as_it_is(capsys):
     finding = {"mechanism": "play", "parameters": {"play@[red]": ROW}, "relative": {}}
     found = {"verdict": "explained", "sentence": WORDS, "findings": [finding], "next_experiment": {"sentence": WORDS}}
     cautions = [{"code": "recording_doubtful", "sentence": WORDS, "grave": False}]
-    show_audit({**found, "adopted": ["play"], "cautions": cautions}, FOLDER)
+    show_audit({**found, "adopted": ["play"], "cautions": cautions}, FOLDER, starts=True)
     shown = capsys.readouterr().out
     assert shown.count(WORDS) == 3
-    assert shown.count(str(FOLDER)) == 3
-    assert "then: rfdropo calibrate 'runs [red] :bomb:/extended.toml' --out OUT" in shown
+    assert shown.count(str(FOLDER)) == 4
+    start = "--from 'runs [red] :bomb:'"
+    assert f"then: rfdropo calibrate 'runs [red] :bomb:/extended.toml' {start} --out OUT" in shown
     assert "play@[red]" in shown
 
 
@@ -60,7 +61,7 @@ def test_a_calibration_says_what_to_type_next(capsys, verdict, words):
 
 def test_an_audit_that_adopts_nothing_has_no_model_to_fit(capsys):
     found = {"verdict": "unexplained", "sentence": "", "findings": [], "adopted": [], "cautions": []}
-    show_audit({**found, "next_experiment": {"sentence": ""}}, FOLDER)
+    show_audit({**found, "next_experiment": {"sentence": ""}}, FOLDER, starts=True)
     assert "then:" not in capsys.readouterr().out
 
 
@@ -97,7 +98,7 @@ def test_a_family_is_shown_by_what_the_data_determine(capsys):
     apart = {"gain_1_less_median": {**ROW, "power": 0, "parameter": "gain_1"}}
     finding = {"mechanism": "cable_gain", "parameters": {"gain_1": ROW}, "relative": apart}
     found = {"verdict": "explained", "sentence": "", "findings": [finding], "next_experiment": {"sentence": ""}}
-    show_audit({**found, "adopted": [], "cautions": []}, FOLDER)
+    show_audit({**found, "adopted": [], "cautions": []}, FOLDER, starts=True)
     shown = capsys.readouterr().out
     assert "gain_1_less_median" in shown
     assert "gain_1 " not in shown

@@ -31,5 +31,5 @@ def test_sentences_of_audits_are_whole(path: Path) -> None:
 
 def test_the_terminal_begins_a_line_with_each(capsys: pytest.CaptureFixture[str]) -> None:
     found: dict[str, Any] = {"verdict": "explained", "sentence": SAID, "findings": [], "adopted": [], "cautions": []}
-    show_audit({**found, "next_experiment": {"sentence": ""}}, Path("audit"))
+    show_audit({**found, "next_experiment": {"sentence": ""}}, Path("audit"), starts=True)
     assert capsys.readouterr().out.splitlines()[:3] == [f"explained: {PARTS[0]}", *PARTS[1:]]

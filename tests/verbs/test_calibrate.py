@@ -190,3 +190,18 @@ def test_optimisations_start_from_the_optimum_of_an_earlier_calibration(tmp_path
     for optimum, expected in (({"young_modulus": 5e6}, [5e6, 5e6, 5e6, 1e6, 2e6, 3e6]), (None, [1e6, 2e6, 3e6])):
         found = earlier_draws(Calibration(record, {"optimum": optimum}, ""), "laplace")
         np.testing.assert_allclose(found["young_modulus"][""], expected)
+
+
+def test_optimisations_start_from_the_extended_model_of_an_audit(tmp_path):
+    """A difference of a group is kept by its owner; an audit that has no such values asks for another."""
+    optimum = {"young_modulus": {"": 5e6}, "play": {"april": 1e-3}}
+    (tmp_path / "audit.json").write_text(json.dumps({"verdict": "explained", "optimum": optimum}))
+    (tmp_path / "extended.toml").write_text("[model]\n")
+    found = earlier_draws(tmp_path, "laplace")
+    assert {name: {owner: draws.tolist() for owner, draws in own.items()} for name, own in found.items()} == {
+        "young_modulus": {"": [5e6]},
+        "play": {"april": [1e-3]},
+    }
+    (tmp_path / "audit.json").write_text(json.dumps({"verdict": "explained"}))
+    with pytest.raises(InputError, match="audit again"):
+        earlier_draws(tmp_path, "laplace")
