@@ -327,6 +327,8 @@ def test_an_audit_whose_time_is_up_after_a_refit_has_its_cause_and_what_it_is_wo
     assert content["gain"]["explained_fraction"] > 0.8
     assert content["verdict"] == "explained"
     assert content["adopted"] == ["play"]
+    size = content["findings"][0]["parameters"]["play"]["mean"]
+    assert content["optimum"]["play"][""] == pytest.approx(size, rel=0.02)  # where a calibration may start
     assert "the gain on unseen recordings" not in content["not_done"]
     assert "naming causes" not in content["not_done"]
     assert "The time was up" in content["sentence"]
