@@ -23,9 +23,9 @@ from rfdropo_bayes.simulators.protocol import Simulator
 # Lanes of one call of an audit: a compilation costs more than the padding of a call, so that there is one size. Calls
 # with few different lanes are the most frequent.
 WIDTH = 8 * max(available_processors(), 2)
-# Step of a derivative to one side, in prior deviations; a larger step is taken to both sides. A
-# delay of .07 s is known to 4e-5 s, and a fit with steps of 1e-2 (a millisecond) ends 1.5e-4 s beside it. Rounding of
-# 1e-13 m errs by 1e-9 m a deviation, the last iteration of an equilibrium by 1e-6 m.
+# Step of a derivative to one side, in prior deviations; a larger step is taken to both sides. A delay of .07 s is known
+# to 4e-5 s, and a fit with steps of 1e-2 (a millisecond) ends 1.5e-4 s beside it. Rounding of 1e-13 m errs by 1e-9 m a
+# deviation, the last iteration of an equilibrium by 1e-6 m.
 STEP = 1e-4
 COARSE = 0.03  # the same for an engine in single precision, whose rounding is 1e-5 m
 

@@ -28,7 +28,10 @@ LAGS = (0.01, 0.05, 0.1, 0.2, 0.4, 0.8)  # [s]
 LOOKED_AT = 20.0  # [s] of a recording, at most
 FEWEST_ROWS = 4  # at the beginning, to compare on
 RANK = 1e-9  # singular values below this share of the largest are rounding: channels that move together
-CLEARLY = 0.7  # ratio of two errors below which the smaller decides; of 160 starts none fell on the wrong side
+# Ratio of two errors below which the smaller decides, and share of the later error that they must differ by in
+# quadrature: of 160 starts none fell on the wrong side. Starts that are told have 1 or more of the later error, servos
+# far from zero .24.
+CLEARLY = 0.7
 STILL = 0.1  # quantile of the distances from row to row, which show the noise if the robot rests in some rows
 MOVES = 11.0  # such distances beyond which a robot moves: 5 deviations of a step of white noise
 PART = 0.1  # share of the way of the markers by which it moves then; more than creep under a held command

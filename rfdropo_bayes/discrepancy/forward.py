@@ -158,14 +158,14 @@ class Forward:
         at null.
         """
         tangent = self.coordinates.physical_tangents(points, directions, self.slots)
-        derivatives = self._differences(points, directions, self.lanes.difference)
+        derivatives = self._differences(points, directions)
         return derivatives | {"offset": self._offset(tangent), **self.coordinates.gain_tangents(points, directions)}
 
-    def _differences(self, points: Points, directions: Points, step: float) -> Fields:
-        """Differences over a step in prior deviations: to one side if it is small, and at bounds; zero if a rollout
-        fails.
+    def _differences(self, points: Points, directions: Points) -> Fields:
+        """Differences over a step in prior deviations (`Lanes.difference`): to one side if it is small, and at bounds;
+        zero if a rollout fails.
         """
-        low, high = self.coordinates.bounds
+        step, (low, high) = self.lanes.difference, self.coordinates.bounds
         size = step / np.maximum(np.abs(directions / self.coordinates.prior_sd).max(axis=1), np.finfo(float).tiny)
         move = size[:, None] * directions
         ahead, behind = (((x >= low) & (x <= high)).all(axis=1) for x in (points + move, points - move))

@@ -221,8 +221,9 @@ def earlier_draws(fit: Calibration | Audit | Path | None, method: str) -> DrawsB
             where="--from",
             remedy=f"leave it out, or use one of {', '.join(OPTIMISING)}",
         )
-    if isinstance(fit, Path) and (fit / AUDIT).is_file() and not (fit / POSTERIOR).is_file():
-        fit = load(fit)
+    if not isinstance(fit, (Calibration, Audit)):
+        folder = Path(fit)  # a report's folder may hold an audit beside its calibration
+        fit = load(folder) if (folder / AUDIT).is_file() and not (folder / POSTERIOR).is_file() else folder
     if isinstance(fit, Audit):
         if "optimum" not in fit.content:
             raise InputError("this audit has no optimum", where="--from", remedy="audit again")
