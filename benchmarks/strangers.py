@@ -1,13 +1,13 @@
 """What does an audit find in the files of a laboratory that nobody knows? Arms, files and effects are drawn at random.
 
-    python benchmarks/strangers.py SEED ... [--at-rest] [--out OUT] [--runs runs/strangers]
+    python benchmarks/strangers.py SEED ... [--at-rest | --mujoco] [--out OUT] [--runs runs/strangers]
 
 For each seed: an outline (length, taper, segments, cables, gravity), recordings of it under random commands with an
 effect of the library hidden, and CSV files in units and a frame of their own; with --at-rest poses without times.
 Then the commands of the README are typed, from init to audit, and a line of OUT/ledger.jsonl says what was hidden and
 what the audit named. A seed whose line is there is not run again; a command that fails is a verdict, too. The
-recordings come from our engine, with shorter time steps or elements than init chooses. An arm in motion takes 3 to 20
-minutes of a processor, at rest 1 to 5 (yardstick 2.4).
+recordings come from our engine, with shorter time steps or elements than init chooses, or with --mujoco from 25 rigid
+links that MuJoCo moves. An arm in motion takes 3 to 20 minutes of a processor, at rest 1 to 5 (yardstick 2.4).
 """
 
 from __future__ import annotations
@@ -33,8 +33,25 @@ from fifteen_minutes import typed
 
 import rfdropo_bayes as rb
 from rfdropo_bayes.files import append_line, read_lines
+from studies.mujoco_truth import CONTROL, ENGINE_EFFECTS, EngineEffect, MuJoCoArm
 
 NOTHING = "nothing"
+
+
+def late(levels: np.ndarray, size: float) -> np.ndarray:
+    """Commands that come ``size`` [s] late."""
+    periods = min(round(size / CONTROL), len(levels) - 1)
+    return np.concatenate([np.repeat(levels[:1], periods, axis=0), levels[: len(levels) - periods]])
+
+
+def with_play(levels: np.ndarray, size: float) -> np.ndarray:
+    """Drives with a play of width ``size`` [m], which begin in its middle."""
+    found = [levels[0]]
+    for row in levels[1:]:
+        found.append(np.clip(found[-1], row - 0.5 * size, row + 0.5 * size))
+    return np.array(found)
+
+
 EFFECTS = (
     NOTHING,
     "command_delay",
@@ -85,7 +102,27 @@ EFFECTS_AT_REST = (
     "plane_anisotropy",
 )
 """The same for poses at rest."""
-HIDDEN = {"motion": EFFECTS, "at_rest": EFFECTS_AT_REST}
+BY_COMMANDS = {
+    "command_delay": EngineEffect(("command_delay",), 0.02, "s", command=late),
+    "backlash": EngineEffect(("backlash",), 1e-3, "m", command=with_play),
+}
+IN_MUJOCO = {next(iter(effect.right)): effect for effect in ENGINE_EFFECTS.values()} | BY_COMMANDS
+EFFECTS_IN_MUJOCO = (
+    NOTHING,
+    "command_delay",
+    "payload",
+    "backlash",
+    "cable_gain",
+    "actuator_lag",
+    NOTHING,
+    "stiffness_gradient",
+    "clock_offset",
+    "cable_compliance",
+)
+"""The same for 25 links in MuJoCo, by its means: masses, stiffnesses, tendons, actuators."""
+LINKS, STEP = 25, 2.5e-4  # of MuJoCo; 40 links and .5 ms move a marker by .01 to .3 mm, of a slender cone by 1 mm
+TAUT = 100.0  # stiffness of its cables in that of the arm along its axis
+HIDDEN = {"motion": EFFECTS, "at_rest": EFFECTS_AT_REST, "mujoco": EFFECTS_IN_MUJOCO}
 SIZE = 3.0  # root mean square of what an effect moves the markers by, in deviations of the noise
 NEAR = 0.2  # relative tolerance of it
 TRIES = 8  # of the search for a size
@@ -201,8 +238,39 @@ class Recorded(NamedTuple):
     size: float
 
 
-def record(own: Laboratory, effect: str, seed: int) -> Recorded | None:
+def noisy(own: Laboratory, positions: Sequence[np.ndarray], seed: int) -> list[np.ndarray]:
+    """Positions [m] of each recording as they are measured."""
+    keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(positions))]
+    errors = [jax.random.normal(key, each.shape) for key, each in zip(keys, positions, strict=True)]
+    return [each + own.noise * np.asarray(error) for each, error in zip(positions, errors, strict=True)]
+
+
+def record_in_mujoco(own: Laboratory, effect: str, seed: int) -> Recorded | None:
+    """The same with the arm in MuJoCo; the size of an effect is looked for in the first recording."""
+    base = {"young_modulus": own.outline["young_modulus"]}
+    plain = rb.Model(own.robot, priors={"young_modulus": {}}, fixed={"rayleigh_stiffness": own.damping})
+    runs = rb.simulate(plain, own.walk, parameters=base, seed=seed)
+    along = base["young_modulus"] * np.pi * own.outline["radius"] ** 2 / own.outline["length"]
+    values = base | {"trunk_mass": own.outline["mass"], "rayleigh_stiffness": own.damping}
+    hidden, size = IN_MUJOCO.get(effect), 0.0
+    arm = MuJoCoArm(own.robot, values, hidden, links=LINKS, step=STEP, cable_stiffness=TAUT * along, settled=True)
+    share = 0.0
+    if hidden is not None:
+        still, size = arm.positions(runs[:1], 0.0), hidden.usual
+        for _ in range(TRIES):
+            share = float(np.sqrt(np.mean((arm.positions(runs[:1], size) - still) ** 2))) / own.noise / SIZE
+            if abs(share - 1.0) < NEAR:
+                break
+            size *= float(np.clip(1.0 / max(share, 1e-9), 0.1, 8.0))
+        else:
+            return None
+    return Recorded(runs, noisy(own, [*arm.positions(runs, size)], seed), base | {"size": size}, share)
+
+
+def record(own: Laboratory, effect: str, seed: int, kind: str) -> Recorded | None:
     """Recordings with an effect that moves the markers by `SIZE` deviations of the noise; None if no size does."""
+    if kind == "mujoco":
+        return record_in_mujoco(own, effect, seed)
     rng, arm, commands = np.random.default_rng([seed, 2]), own.robot, own.commands(seed)
     settings: dict[str, Any] = {
         "priors": {"young_modulus": {}},
@@ -213,10 +281,7 @@ def record(own: Laboratory, effect: str, seed: int) -> Recorded | None:
     still = rb.simulate(plain, commands, parameters=base, seed=seed)
 
     def recorded(runs: Sequence[rb.Trajectory], values: dict[str, float], size: float) -> Recorded:
-        keys = [jax.random.fold_in(jax.random.key(seed), number) for number in range(len(runs))]
-        errors = [jax.random.normal(key, run.position.shape) for key, run in zip(keys, runs, strict=True)]
-        seen = [run.position + own.noise * np.asarray(each) for run, each in zip(runs, errors, strict=True)]
-        return Recorded(runs, seen, values, size)
+        return Recorded(runs, noisy(own, [run.position for run in runs], seed), values, size)
 
     if effect == NOTHING:
         return recorded(still, base, 0.0)
@@ -285,10 +350,10 @@ def write_files(own: Laboratory, recorded: Recorded, seed: int, folder: Path) ->
     return " ".join(f"--{name}={value}" for name, value in options.items())
 
 
-def audited(seed: int, effect: str, rests: bool, folder: Path) -> dict[str, Any]:
+def audited(seed: int, effect: str, kind: str, folder: Path) -> dict[str, Any]:
     """Draw, record, type the README's commands; what was hidden and what was said."""
-    own = draw_laboratory(np.random.default_rng([seed, 1]), rests)
-    recorded = record(own, effect, seed)
+    own = draw_laboratory(np.random.default_rng([seed, 1]), kind == "at_rest")
+    recorded = record(own, effect, seed, kind)
     if recorded is None:
         return {"hidden": effect, "verdict": "unreached", "sentence": "no size moves it enough"}
     options = write_files(own, recorded, seed, folder / "data")
@@ -310,7 +375,7 @@ def audited(seed: int, effect: str, rests: bool, folder: Path) -> dict[str, Any]
     return {
         "hidden": effect,
         "right": silent if effect in (NOTHING, *base) else effect in first,
-        "rests": rests,
+        "rests": own.rests,
         "base": base,
         "share_of_size": round(recorded.size, 3),
         "truth": recorded.truth,
@@ -323,7 +388,8 @@ def audited(seed: int, effect: str, rests: bool, folder: Path) -> dict[str, Any]
         "verdict": audit["verdict"],
         "named": [finding["mechanism"] for finding in audit["findings"]],
         "classes": [finding["equivalence_class"] for finding in audit["findings"]],
-        "sizes": sizes_beside_truth(audit, own, effect, recorded.truth),
+        "sizes": [] if kind == "mujoco" else sizes_beside_truth(audit, own, effect, recorded.truth),
+        "parameters": {finding["mechanism"]: finding["parameters"] for finding in audit["findings"]},
         "sentence": audit["sentence"],
         "fit_mm": [*summary["rmse"]["fit"].values()][-1],
         "test_mm": [*summary["rmse"]["test"].values()][-1],
@@ -384,22 +450,24 @@ def main() -> None:
     """Run the seeds that the ledger does not have yet, and write its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("seeds", nargs="+", type=int, metavar="SEED")
-    parser.add_argument("--at-rest", action="store_true", help="poses without times instead of motion")
-    parser.add_argument("--out", type=Path, help="reports/strangers/motion or at_rest by default")
+    parser.add_argument(
+        "--at-rest", dest="kind", action="store_const", const="at_rest", default="motion", help="poses without times"
+    )
+    parser.add_argument("--mujoco", dest="kind", action="store_const", const="mujoco", help="arms that MuJoCo moves")
+    parser.add_argument("--out", type=Path, help="reports/strangers/motion, at_rest or mujoco by default")
     parser.add_argument("--runs", type=Path, default=Path("runs/strangers"))
     given = parser.parse_args()
-    kind = "at_rest" if given.at_rest else "motion"
-    out = given.out or Path("reports/strangers") / kind
+    out = given.out or Path("reports/strangers") / given.kind
     ledger = out / "ledger.jsonl"
     ledger.parent.mkdir(parents=True, exist_ok=True)
     known = {line["seed"] for line in read_lines(ledger)}
     for seed in given.seeds:
         if seed not in known:
-            folder = given.runs / kind / str(seed)
+            folder = given.runs / given.kind / str(seed)
             shutil.rmtree(folder, ignore_errors=True)
-            effect = HIDDEN[kind][seed % len(HIDDEN[kind])]
+            effect = HIDDEN[given.kind][seed % len(HIDDEN[given.kind])]
             try:
-                row = audited(seed, effect, given.at_rest, folder)
+                row = audited(seed, effect, given.kind, folder)
             except subprocess.CalledProcessError as error:
                 said = f"failed: {shlex.join(error.cmd[3:])}"
                 row = {"hidden": effect, "verdict": "failed", "right": False, "sentence": said}

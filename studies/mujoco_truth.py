@@ -31,6 +31,8 @@ SHEARED = 6.0 * (1.0 + POISSON) / (7.0 + 6.0 * POISSON)  # share of a solid roun
 CONTROL = 1e-3  # [s] for which a command is held
 CABLE = 5e4  # [N/m] of a servo
 CABLE_DAMPING = 5.0  # [N s/m]
+STILL = 1e-6  # m that a marker moves in a twentieth of a second, below which an arm rests
+LONGEST = 60.0  # [s] that an arm may take to come to rest
 
 
 @dataclass(frozen=True)
@@ -75,9 +77,9 @@ def _friction(model: Any, size: float) -> None:
 
 
 def _soft_cables(model: Any, size: float) -> None:
-    kept = 1.0 / (1.0 + size * CABLE)
+    kept = 1.0 / (1.0 + size * model.actuator_gainprm[:, 0])
     model.actuator_gainprm[:, 0] *= kept
-    model.actuator_biasprm[:, :2] *= kept
+    model.actuator_biasprm[:, :2] *= kept[:, None]
 
 
 def _moved_marker(model: Any, size: float) -> None:
@@ -136,7 +138,9 @@ class _Section(NamedTuple):
     turn: tuple[float, float, float]
 
 
-def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS, step: float = STEP) -> str:
+def arm_xml(
+    robot: Robot, values: Mapping[str, float], links: int = LINKS, step: float = STEP, cable_stiffness: float = CABLE
+) -> str:
     """MJCF of a robot with a body of layers, a channel for each cable, and markers on its axis. Actuators take
     displacements.
 
@@ -145,6 +149,7 @@ def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS, step:
         values: ``young_modulus`` [Pa], ``trunk_mass`` [kg] and ``rayleigh_stiffness`` [s].
         links: pieces of the body.
         step: of time [s].
+        cable_stiffness: of a cable with its servo [N/m].
     """
     root = ElementTree.Element("mujoco")
     gravity = " ".join(map(str, robot.gravity_m_s2))
@@ -168,29 +173,26 @@ def arm_xml(robot: Robot, values: Mapping[str, float], links: int = LINKS, step:
             if (low <= z < high) or (section is None and z < high):
                 ElementTree.SubElement(body, "site", name=name, pos=f"{x:.9g} {y:.9g} {z - low:.9g}", size="0.001")
     tendons, actuators = ElementTree.SubElement(root, "tendon"), ElementTree.SubElement(root, "actuator")
-    limits = {
-        n: f"{low:.9g} {high:.9g}" for n, low, high in zip(robot.channel_names, *robot.command_limits(), strict=True)
-    }
-    for cable in robot.cables:
+    for cable, least, most in zip(robot.cables, *robot.command_limits(), strict=True):
         path = ElementTree.SubElement(tendons, "spatial", name=cable.name)
         for k in range(1 + len(cable.guide_z_m)):
             ElementTree.SubElement(path, "site", site=f"{cable.name}{k}")
         rest = float(np.linalg.norm(np.diff(_path(cable), axis=0), axis=1).sum())
-        # The tension is CABLE (displacement + length - length at rest), and not below zero. A transmission of -1 turns
-        # the length's sign.
+        # The tension is the stiffness times (displacement + length - length at rest), and not below zero. A
+        # transmission of -1 turns the length's sign.
         ElementTree.SubElement(
             actuators,
             "general",
             name=cable.name,
             tendon=cable.name,
             gear="-1",
-            gainprm=f"{CABLE}",
+            gainprm=f"{cable_stiffness}",
             biastype="affine",
-            biasprm=f"{-CABLE * rest:.12g} {-CABLE} {-CABLE_DAMPING}",
+            biasprm=f"{-cable_stiffness * rest:.12g} {-cable_stiffness} {-CABLE_DAMPING}",
             forcelimited="true",
             forcerange="0 1e5",
             ctrllimited="true",
-            ctrlrange=limits[cable.name],
+            ctrlrange=f"{least:.9g} {most:.9g}",
         )
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -345,14 +347,20 @@ class EngineArm(ABC):
 
 @dataclass(frozen=True)
 class MuJoCoArm(EngineArm):
-    """The robot in MuJoCo; its values, links and step, a part of `CONTROL`, are those of `arm_xml`."""
+    """The robot in MuJoCo; values, links, step, a part of `CONTROL`, and stiffness are those of `arm_xml`. It starts
+    undeformed, or ``settled`` at rest under its first command.
+    """
 
     links: int = LINKS
     step: float = STEP
+    cable_stiffness: float = CABLE
+    settled: bool = False
 
     def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
         mujoco = engine()
-        model = mujoco.MjModel.from_xml_string(arm_xml(self.robot, self.values, self.links, self.step))
+        model = mujoco.MjModel.from_xml_string(
+            arm_xml(self.robot, self.values, self.links, self.step, self.cable_stiffness)
+        )
         effect = self.effect
         if effect is not None and effect.model is not None:
             effect.model(model, size)
@@ -360,6 +368,13 @@ class MuJoCoArm(EngineArm):
         clock, held = commanded(self.robot, recording, effect, size)
         markers = [model.site(name).id for name in self.robot.marker_names]
         path = np.empty((len(clock), len(markers), 3))
+        data.ctrl[:] = held[0]
+        for _ in range(round(20 * LONGEST) if self.settled else 0):
+            mujoco.mj_kinematics(model, data)
+            before = data.site_xpos[markers].copy()
+            mujoco.mj_step(model, data, nstep=round(0.05 / self.step))
+            if np.abs(data.site_xpos[markers] - before).max() < STILL:
+                break
         for row, level in enumerate(held):
             mujoco.mj_kinematics(model, data)
             path[row] = data.site_xpos[markers]
