@@ -215,7 +215,7 @@ class ExtensionSearch:
         return shift is not None and shift <= noise_distance(self.target.measured.noise.first)
 
     def tested(self, fit: Fit, number: int) -> ScoreTests:
-        """The joint test of a model, without tests of candidates and without rollouts."""
+        """The joint test of a model, without tests of candidates."""
         tests = run_score_tests(self.target, fit, [], [], [self.seed, number], self.rules.bootstraps)
         return replace(tests, omnibus=self._tested(fit, number))
 

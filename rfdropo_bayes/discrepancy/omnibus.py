@@ -13,6 +13,7 @@ DIRECTED = "candidates"  # the statistic that is the largest score of any candid
 # Share of the level that this statistic gets. Of 75 effects of rho .15 it shows 72 at its share of 2 %, the others show
 # 15 at theirs, and none besides.
 SHARE = 0.75
+POSE = "pose"  # the statistic of what depends on the predicted pose, see `pose_regressors`
 BLOCK = 10  # rows
 LAGS = 10
 
@@ -83,13 +84,34 @@ def block_squares(
     return np.where(count > 0, np.sum(sums**2, axis=(0, 2)) / np.maximum(count, 1.0), np.nan)
 
 
+def pose_regressors(
+    position: Float[np.ndarray, "group time marker 3"], valid: Bool[np.ndarray, "group time column"]
+) -> Float[np.ndarray, "regressor group time column"]:
+    """Errors of each coordinate that depend on the predicted pose: a shift, a drift, an affine map of the pose, and its
+    rate, the same for all markers.
+
+    A model with a wrong cause that predicts nearly as well leaves little, and leaves it there; a test that asks for any
+    pattern does not see it. That errors must not depend on predictions is the idea of Ramsey's RESET (1969). Measured
+    positions would not do: their noise is in the errors as well.
+    """
+    usable = valid.reshape(position.shape)
+    mean = np.mean(position, axis=(0, 1, 2), where=usable, keepdims=True)
+    rate = np.diff(position, axis=1, prepend=position[:, :1])
+    drift = np.broadcast_to(np.linspace(-1.0, 1.0, position.shape[1])[:, None, None], usable.shape)
+    found = []
+    for axis, unit in enumerate(np.eye(3)):
+        found += [part * unit for part in (np.ones(usable.shape), drift, rate)]
+        found += [np.where(np.arange(3) == axis, (position - mean)[..., [k]], 0.0) for k in range(3)]
+    return np.stack([np.where(usable, each, 0.0).reshape(valid.shape) for each in found])
+
+
 def joint_test(
     observed: dict[str, float], simulated: dict[str, Float[np.ndarray, " count"]], blocks: Float[np.ndarray, " block"]
 ) -> Omnibus:
     """Calibrate each statistic, and the smallest p-value, against the simulated statistics.
 
-    The largest score of the candidates has `SHARE` of the level, all other statistics together have the rest: five
-    statistics that ask whether anything at all is wrong must not hide the effect of a known cause. The observed data
+    The largest score of the candidates has `SHARE` of the level, all other statistics together have the rest: tests
+    that ask whether anything at all is wrong must not hide the effect of a known cause. The observed data
     set is ranked among the simulated data sets in every step: under a right model it is one of them, and the joint
     p-value is then valid at any level. Ties in the smallest p-value are broken by the distance from the median.
     """

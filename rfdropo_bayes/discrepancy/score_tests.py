@@ -2,7 +2,7 @@
 
 All p-values come from a parametric bootstrap: residuals are simulated under a right model. Noise is drawn for every
 recording, the noise model is estimated as for the data, and the base model is refitted linearly. No rollouts are
-needed.
+needed but the one of the prediction.
 """
 
 from __future__ import annotations
@@ -19,11 +19,20 @@ from rfdropo_bayes.bayes.noise.stacked import Stacked
 from rfdropo_bayes.discrepancy.candidates import Probe
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget
 from rfdropo_bayes.discrepancy.measurements import Measurements
-from rfdropo_bayes.discrepancy.omnibus import DIRECTED, Omnibus, block_squares, joint_test, statistics
-from rfdropo_bayes.discrepancy.score import project_out, span, statistic
+from rfdropo_bayes.discrepancy.omnibus import (
+    DIRECTED,
+    POSE,
+    Omnibus,
+    block_squares,
+    joint_test,
+    pose_regressors,
+    statistics,
+)
+from rfdropo_bayes.discrepancy.score import Signature, project_out, signature, span, statistic
 from rfdropo_bayes.discrepancy.unknown_size import linear_evidence
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
+SEEN = 0.01  # of a regressor's norm, below which base parameters imitate it
 
 
 @dataclass(frozen=True)
@@ -96,8 +105,9 @@ def run_score_tests(
     # many of its deviations.
     measured = np.stack([fit.residual] if finer is None else [fit.residual, finer])
     residuals = project_out(base, measured.T).T
-    observed, surprises = _statistics(target, residuals, seen)
-    simulated, reference = _simulated(target, fit, seen, np.random.default_rng(seed), bootstraps)
+    pose = _of_the_pose(target, fit, base)
+    observed, surprises = _statistics(target, residuals, seen, pose)
+    simulated, reference = _simulated(target, fit, seen, pose, np.random.default_rng(seed), bootstraps)
     if target.noise.source == RESIDUALS:  # their mean square equals the residuals' by construction
         del observed["variance"], simulated["variance"]
     most = reference.max(axis=1) if seen else np.zeros(bootstraps)
@@ -126,16 +136,29 @@ def run_score_tests(
     )
 
 
+def _of_the_pose(target: FitTarget, fit: Fit, base: Float[np.ndarray, "n rank"]) -> Signature:
+    """The part of `pose_regressors` that base parameters cannot imitate."""
+    measured = target.measurements
+    groups, rows, _ = measured.count.shape
+    shown = target.recall("shown", [fit.x], lambda: {"position": target.forward.observe_one(fit.x)["position"]})
+    position = shown["position"].reshape(groups, -1, measured.markers // 3, 3)[:, :rows]
+    errors = np.zeros((6 * 3, *measured.count.shape))
+    errors[..., : measured.markers] = pose_regressors(position, measured.valid[..., : measured.markers])
+    columns = np.zeros((measured.size, len(errors)))
+    columns[: measured.count.size] = measured.whiten(errors, target.noise).T
+    return signature(base, columns / np.maximum(SEEN * np.linalg.norm(columns, axis=0), np.finfo(float).tiny))
+
+
 def _statistics(
-    target: FitTarget, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe]
+    target: FitTarget, residuals: Float[np.ndarray, "count n"], probes: Sequence[Probe], pose: Signature
 ) -> tuple[dict[str, np.ndarray], Float[np.ndarray, "count probe"]]:
-    joint = statistics(target.measurements.series(residuals))
+    joint = statistics(target.measurements.series(residuals)) | {POSE: statistic(pose, residuals)[1]}
     surprises = [statistic(probe.mark, residuals)[1] for probe in probes]
     return joint, np.stack(surprises, axis=1) if probes else np.zeros((len(residuals), 0))
 
 
 def _simulated(
-    target: FitTarget, fit: Fit, probes: Sequence[Probe], rng: np.random.Generator, count: int
+    target: FitTarget, fit: Fit, probes: Sequence[Probe], pose: Signature, rng: np.random.Generator, count: int
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     base = span(fit.jacobian)
     chunk = max(1, min(count, int(CHUNK_NUMBERS / base.shape[0])))
@@ -143,7 +166,7 @@ def _simulated(
     for start in range(0, count, chunk):
         size = min(chunk, count - start)
         residuals = null_residuals(target.measurements, target.noise, base, len(fit.free), rng, size)
-        parts.append(_statistics(target, residuals, probes))
+        parts.append(_statistics(target, residuals, probes, pose))
     joined = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
     return joined, np.concatenate([part[1] for part in parts])
 
