@@ -243,7 +243,7 @@ def write_first_files(
     known: dict[str, Any] = {"gravity": outline.gravity, "cables": outline.cable_names(), "kept": kept}
     tables = partial(data_tables, folder, outline.markers, recordings, commands, guess=guess, **known)
     plain = write(tables())
-    runs, unread = _recordings(plain, folder)
+    runs, unread = read_back(plain, folder)
     if not runs:
         return robot, experiment, unread
     first = runs[0]
@@ -267,7 +267,7 @@ def write_first_files(
     poses = None if guess.command_time is not None else poses
     tables = partial(tables, pieces=pieces, poses=poses)
     placed = write(tables(frame=frame), slow, first)
-    runs, unread = _recordings(placed, folder)
+    runs, unread = read_back(placed, folder)
     columns = None if placed.data is None else placed.data.columns
     if not runs or columns is None or not usual:
         return robot, experiment, unread
@@ -321,7 +321,7 @@ def _of_poses(first: Trajectory, timed: bool) -> str | None:
     return f"a quadratic map of the commands of a pose's own row leaves {errors}"
 
 
-def _recordings(experiment: Experiment, folder: Path) -> tuple[list[Trajectory], str]:
+def read_back(experiment: Experiment, folder: Path) -> tuple[list[Trajectory], str]:
     """The recordings of fit and test; if one cannot be read, none, and the reason."""
     if experiment.data is None:
         return [], ""

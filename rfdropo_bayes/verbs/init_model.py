@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from rfdropo_bayes.data import DataSpec, load_recordings
+from rfdropo_bayes.data import DataSpec, group_repeats, load_recordings
 from rfdropo_bayes.data.named_columns import METRES, ROWS
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import output_folder
-from rfdropo_bayes.model.experiment import load_experiment
+from rfdropo_bayes.model.experiment import Experiment, load_experiment
 from rfdropo_bayes.model.model_spec import find_robot
 from rfdropo_bayes.simulators.adapters import first_tables
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess
 from rfdropo_bayes.verbs.column_units import ANGLES
-from rfdropo_bayes.verbs.init import data_tables, quoted, with_given
+from rfdropo_bayes.verbs.days import days_of, pieces_of
+from rfdropo_bayes.verbs.init import data_tables, quoted, read_back, with_given
 
 OF_CABLE = {"m": tuple(METRES), "rad": ANGLES}  # units of commands in recordings, for each unit of a simulator
 
@@ -32,7 +34,7 @@ def write_model_experiment(
     Args:
         model: file of the model, which is not moved.
         folder: folder to create and write to.
-        recordings: files to fit; the last third of several, or the last ``kept``, are for testing.
+        recordings: files to fit; a third, without repeats of fitted commands, or the last ``kept`` are for testing.
         commands: files of commands, one for each recording, if separate.
         guess: guess of the recordings' columns; None without recordings.
 
@@ -55,22 +57,27 @@ def write_model_experiment(
     box: Any = find_robot(name, folder, tables)
     if guess is not None and guess.command_unit not in OF_CABLE.get(box.command_unit, ()):
         guess = with_given(guess, command_unit=box.command_unit)
-    text = [
-        "# Written by rfdropo init; docs/reference/experiment.md has every key. Look it over, then: rfdropo check.",
-        f"title = {quoted(model.stem)}",
-        f"robot = {quoted(name)}",
-        "seed = 0",
-        "",
-        *_adapter(tables, assumed),
-        *(
-            _random(box)
-            if guess is None
-            else data_tables(folder, list(tables["markers"]), recordings, commands, guess, kept=kept)
-        ),
-        *_inferred(tables),
-    ]
-    experiment.write_text("\n".join(text), encoding="utf-8")
-    load_experiment(experiment)
+
+    def write(data: list[str]) -> Experiment:
+        head = [
+            "# Written by rfdropo init; docs/reference/experiment.md has every key. Look it over, then: rfdropo check.",
+            f"title = {quoted(model.stem)}",
+            f"robot = {quoted(name)}",
+            "seed = 0",
+            "",
+        ]
+        lines = [*head, *_adapter(tables, assumed), *data, *_inferred(tables)]
+        experiment.write_text("\n".join(lines), encoding="utf-8")
+        return load_experiment(experiment)[0]
+
+    if guess is None:
+        write(_random(box))
+        return experiment, assumed
+    columns = partial(data_tables, folder, list(tables["markers"]), recordings, commands, guess, kept=kept)
+    runs, _ = read_back(write(columns()), folder)
+    if len(runs) == len(recordings):
+        timed, counts = guess.time is not None or guess.sample_time is not None, [len(run.time) for run in runs]
+        write(columns(pieces=pieces_of(counts, days_of(recordings), group_repeats(runs), timed=timed, kept=kept)))
     return experiment, assumed
 
 

@@ -76,6 +76,16 @@ def test_init_finds_the_elements_and_says_what_it_assumed(place):
         rfdropo("init", "reacher.xml")
 
 
+def test_a_repeat_of_fitted_commands_is_not_kept_for_the_test(place):
+    recorded(place, 0.0)
+    again = pd.read_csv(place / "run_0.csv")
+    again.iloc[:, 3:] += 0.2 * np.random.default_rng(1).standard_normal(again.iloc[:, 3:].shape)
+    again.to_csv(place / "run_3.csv", index=False)
+    rfdropo("init", "reacher.xml", "--recording", "run_*.csv")
+    runs, test = rb.Model.read(place / "reacher" / "experiment.toml").runs(None)
+    assert ([run.name for run in runs], [run.name for run in test]) == (["run_0", "run_1", "run_3"], ["run_2"])
+
+
 def test_without_a_recording_or_a_site_all_bodies_that_move_are_markers(place):
     shutil.copyfile(REACHER.parent / "inverted_pendulum.xml", place / "pendulum.xml")
     assert "markers are all bodies that move, cart, pole" in rfdropo("init", "pendulum.xml")
