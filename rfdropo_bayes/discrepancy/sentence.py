@@ -13,6 +13,7 @@ from rfdropo_bayes.discrepancy.deadline import INTERRUPT
 from rfdropo_bayes.discrepancy.extension import DISCRETISATION, TOLD_APART
 from rfdropo_bayes.discrepancy.gain import Gain, noise_distance
 from rfdropo_bayes.discrepancy.law_words import law_sentence, ports_sentence
+from rfdropo_bayes.discrepancy.omnibus import POSE
 from rfdropo_bayes.discrepancy.pipeline import Answer
 from rfdropo_bayes.discrepancy.prequential import BEGINNING, begins_wrong, prequential
 from rfdropo_bayes.discrepancy.prior_ends import in_words
@@ -335,8 +336,10 @@ def _only_noise(answer: Answer) -> bool:
 
 def _pattern(answer: Answer) -> str:
     """Clause about an extended model that fails the joint test."""
-    rules, last = answer.problem.rules, answer.test_series[-1].omnibus.p
-    words = f"the fitted recordings keep a pattern (joint test p {p_in_words(last, rules.bootstraps)})"
+    rules, omnibus = answer.problem.rules, answer.test_series[-1].omnibus
+    last, single = omnibus.p, omnibus.single
+    follows = " that follows the pose" if single[POSE] < min(p for name, p in single.items() if name != POSE) else ""
+    words = f"the fitted recordings keep a pattern{follows} (joint test p {p_in_words(last, rules.bootstraps)})"
     if last > rules.level or _only_noise(answer):
         return words
     gain, numerical = answer.validation.gain, answer.numerical

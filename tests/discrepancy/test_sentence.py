@@ -50,6 +50,13 @@ def test_nothing_else_is_at_work_where_all_that_remains_is_noise(answer):
     assert "of it noise" in more
 
 
+def test_a_pattern_that_only_the_pose_explains_is_said_to_follow_it(answer):
+    *before, last = answer.test_series
+    single = dict.fromkeys(last.omnibus.single, 0.2) | {"pose": 0.001}
+    follows = replace(last, omnibus=replace(last.omnibus, single=single))
+    assert "keep a pattern that follows the pose (joint" in said(replace(answer, test_series=[*before, follows]))
+
+
 def test_a_rest_as_small_as_the_error_of_the_simulation_is_no_further_cause(answer):
     """Errors 10 % above the noise leave .46 of it, in quadrature."""
     floor = 3**0.5 * NOISE
