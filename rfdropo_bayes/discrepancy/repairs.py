@@ -180,9 +180,13 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
     assert candidate is not None
     gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
     kept, fit_targets = list(steps[:index]), [step.fit_target for step in steps[: index + 1]]
-    # The next step now follows the model before the dropped step, with the tests and refits beside that model.
+    # The next step now follows the model before the dropped step, with the tests and refits beside that model. If the
+    # dropped step had taken the place of another, these have its rivals alone, and the next step keeps its own.
+    dropped, following = steps[index], list(steps[index + 1 :][:1])
+    tested = {row.name for row in dropped.before.rows}
     following = [
-        replace(step, before=steps[index].before, refits=steps[index].refits) for step in steps[index + 1 :][:1]
+        replace(step, before=dropped.before, refits=dropped.refits) if step.name in tested else step
+        for step in following
     ]
     for step in [*following, *steps[index + 2 :]]:
         before, start = kept[-1].fit if kept else base, step.fit.x.copy()

@@ -13,7 +13,7 @@ from rfdropo_bayes.discrepancy.base_fit import base_model
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch
 from rfdropo_bayes.discrepancy.fit import optimise
 from rfdropo_bayes.discrepancy.pipeline import audit
-from rfdropo_bayes.discrepancy.repairs import optimised_again, simplified
+from rfdropo_bayes.discrepancy.repairs import optimised_again, simplified, without
 
 from .toys import Geared, Opposed, Turned, problem_of
 
@@ -96,3 +96,7 @@ def test_a_common_gain_takes_the_place_of_single_gains_after_the_effect_that_the
     assert kept[1].fit.log_evidence > both.log_evidence
     # A candidate that was not refitted in that step is no alternative.
     assert simplified(search, base, [replace(steps[0], refits={"cable_gains": 9.0}), steps[1]])[0].name == "cable_gains"
+    # A step that took the place of another was tested beside its rivals alone; the next step keeps its own tests.
+    rivals = replace(tests, rows=(tests.row("cable_gains"),))
+    (left,) = without(search, [replace(steps[0], before=rivals), steps[1]], 0, base)
+    assert left.before.row("play") == tests.row("play")
