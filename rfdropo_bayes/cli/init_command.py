@@ -32,7 +32,12 @@ FOUND = (
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
 LENGTHS = ("length", "radius", "tip_radius", "inner_radius", "cable_radius", "spool_radius")
-FACTORS = {**dict.fromkeys(LENGTHS, MILLIMETRES), "mass": 1e-3, "young_modulus": 1e6}  # from the units of options to SI
+FACTORS = {
+    **dict.fromkeys(LENGTHS, MILLIMETRES),
+    "mass": 1e-3,
+    "young_modulus": 1e6,
+    "area": 1e-6,
+}  # from the units of options to SI
 
 
 class Questions:
@@ -156,6 +161,9 @@ Gravity = Annotated[
     str | None,
     typer.Option(help="direction of gravity: +z for a robot that hangs, -z for a robot that stands, -y, ..."),
 ]
+ChamberArea = Annotated[
+    float | None, typer.Option("--chamber-area-mm2", help="area of a chamber across the axis, for pressures [mm2]")
+]
 Mass = Annotated[float | None, typer.Option("--mass-g", help="mass of the body [g]; silicone by default")]
 Modulus = Annotated[float | None, typer.Option("--modulus-mpa", help="Young's modulus of the body [MPa]")]
 Markers = Annotated[
@@ -196,6 +204,7 @@ def init(
     command_names: CommandNames = None,
     sample_time: SampleTime = None,
     spool_radius: SpoolRadius = None,
+    chamber_area: ChamberArea = None,
     gravity: Gravity = None,
     mass: Mass = None,
     modulus: Modulus = None,
@@ -253,6 +262,9 @@ def init(
     answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
     if unit in (*ANGLES, "N m"):
         answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
+    if unit in PASCALS:
+        words = "Area of a chamber across the axis [mm2]; 0 if unknown"
+        answers["area"] = ask.answer("area", chamber_area, words, 0.0) or None
     answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")
     if answers["segments"] > 1 or not answers["gravity"].endswith("z"):
         ask.assumed.add("segment_azimuths")

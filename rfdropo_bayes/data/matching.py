@@ -61,8 +61,7 @@ def check_channels(trajectory: Trajectory, channels: Sequence[str], unit: str) -
         raise InputError(
             f"the recording has commands in {trajectory.command_unit}, the robot in {unit}",
             where=trajectory.name,
-            remedy="correct command_unit under [data.columns]; for another drive, change [command] unit and [channels] "
-            "of the robot"
+            remedy="correct command_unit under [data.columns]; for other drives, run init again with --command-unit"
             if plain
             else "use the robot that was recorded",
         )

@@ -114,12 +114,12 @@ def resampled_by_first_row(
 
 
 def first_row_distances(predictions: Sequence[RecordingPrediction], model_error: ModelError | None) -> dict[str, float]:
-    """Distance of measured from predicted first rows in units of the model error, if it exceeds chance.
+    """Distance of measured from predicted first rows in units of the model error, if it exceeds chance among all rows.
 
     Errors of a row are assumed normal, with the sizes and the number of independent coordinates of the residuals
     (`ModelError.share`).
     """
-    distances = {}
+    distances, chance = {}, SURE ** (1.0 / max(len(predictions), 1))
     for p in predictions:
         seen = [
             i for i, name in enumerate(p.marker_names) if p.mask[0, i] and model_error and name in model_error.markers
@@ -129,7 +129,7 @@ def first_row_distances(predictions: Sequence[RecordingPrediction], model_error:
         error = np.linalg.norm(p.observed[0, seen] - p.central[0, seen], axis=1)
         size = np.sqrt(model_error.share) * _errors([p.marker_names[i] for i in seen], model_error)
         times, count = float(np.sqrt(np.mean((error / size) ** 2))), 3.0 * model_error.share * len(seen)
-        if count * times**2 > chi2.ppf(SURE, count):
+        if count * times**2 > chi2.ppf(chance, count):
             distances[p.name] = times
     return distances
 

@@ -56,6 +56,7 @@ class RobotOutline:
     # drives of cables, or "Pa": the body then has chambers in place of cables
     command_unit: Literal["m", "rad", "N", "N m", "Pa", "-"] = "m"
     spool_radius: float = 0.01
+    area: float | None = None  # area of a chamber across the axis [m2]; by default in proportion to the body's
     gravity: str = "+z"  # direction of gravity, such as "+z" for a robot that hangs
     mass: float | None = None  # mass of the body [kg]; None for silicone of its volume
     young_modulus: float = 1e6  # Young's modulus [Pa]
@@ -186,7 +187,7 @@ class RobotOutline:
     @property
     def sets_bend(self) -> str | None:
         """The assumed attribute that sets how far a command bends the body; None if all that do were given."""
-        names = {"m": ("cable_radius",), "rad": ("spool_radius", "cable_radius")}.get(
+        names = {"m": ("cable_radius",), "rad": ("spool_radius", "cable_radius"), "Pa": ("young_modulus", "area")}.get(
             self.command_unit, ("young_modulus",)
         )
         return next((name for name in names if name in self.assumed), None)
@@ -222,11 +223,11 @@ class RobotOutline:
             wider = arm / sized.arm
             tip = None if sized.tip_radius is None else _rounded(wider * sized.tip_radius)
             return replace(sized, radius=_rounded(wider * sized.radius), tip_radius=tip)
+        before, after = (o.bending_force / o.force_of_unit / o.young_modulus * o.arm / o.length for o in (self, sized))
         if self.sets_bend == "young_modulus":
-            before, after = (
-                o.bending_force / o.force_of_unit / o.young_modulus * o.arm / o.length for o in (self, sized)
-            )
             return replace(sized, young_modulus=_rounded(self.young_modulus / softness * before / after))
+        if self.sets_bend == "area":
+            return replace(sized, area=_rounded(bend * sized.chamber_area * after / before))
         return sized
 
     @property
@@ -236,8 +237,8 @@ class RobotOutline:
 
     @property
     def chamber_area(self) -> float:
-        """Area of a chamber across the axis [m2], assumed."""
-        return np.pi * (CHAMBER_RADIUS * self.inside) ** 2
+        """Area of a chamber across the axis [m2]."""
+        return self.area or np.pi * (CHAMBER_RADIUS * self.inside) ** 2
 
     @property
     def newtons(self) -> float:
@@ -379,8 +380,8 @@ def _cables(o: RobotOutline) -> list[str]:
 def _chambers(o: RobotOutline) -> list[str]:
     usual = o.bending_force / o.chamber_area if o.usual_command is None else o.usual_command
     lines = [
-        "# Chambers beside the axis, from +x towards +y. ASSUMED: their area, and that they reach along their segment;",
-        "# the inferred stiffness is relative to the area." + _mark(o, "cables", "cable_radius", "segment_lengths"),
+        "# Chambers beside the axis, from +x towards +y. ASSUMED: that they reach along their segment. The inferred",
+        "# stiffness is relative to their area." + _mark(o, "area", "cables", "cable_radius", "segment_lengths"),
         *([f"# ASSUMED azimuths: {o.azimuth_evidence}."] if o.azimuth_evidence else []),
     ]
     names, ends = o.cable_names(), [0.0, *o.segment_ends()]

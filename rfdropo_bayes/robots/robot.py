@@ -254,8 +254,9 @@ class Robot(RobotTable):
                 from ``segment_azimuths`` [deg] on (``azimuth_evidence`` and ``size_evidence``: reasons for these, and
                 for the sizes), at ``cable_radius`` from the axis at the base; with ``pairs`` opposite cables share a
                 motor. ``command_unit``: "m" of cable, "rad" or "N m" of a motor with ``spool_radius``, "N" of tension,
-                "Pa" of chambers, or "-" of other drives; ``usual_command``: the size of usual commands. ``gravity``:
-                its direction, "+z" for a robot that hangs. ``mass`` [kg], silicone by default; ``young_modulus`` [Pa].
+                "Pa" of chambers of ``area`` [m2], or "-" of other drives; ``usual_command``: the size of usual
+                commands. ``gravity``: its direction, "+z" for a robot that hangs. ``mass`` [kg], silicone by default;
+                ``young_modulus`` [Pa].
 
         Raises:
             InputError: an unknown answer, a missing answer, or answers that make no robot.

@@ -49,7 +49,8 @@ AIMED = re.compile(r"goal|target|desired|(?<![a-z])(ref|reference|set)(?![a-z])"
 """What a controller aims at: a command of its drives, or in x, y and z a place that the robot should reach."""
 SENT = re.compile(rf"cmd|command|action|setpoint|{AIMED.pattern}", re.IGNORECASE)
 COMMAND = re.compile(
-    rf"{SENT.pattern}|motor|servo|pull|cable|tendon|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)", re.IGNORECASE
+    rf"{SENT.pattern}|motor|servo|pressure|chamber|pull|cable|tendon|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
+    re.IGNORECASE,
 )
 NO_COMMAND = re.compile(
     r"(?<![a-z])(ids?|idx|index|frames?|seq|rows?|numbers?|nr|trial|episode|run|phase|pattern|label|flags?|status|mode|"

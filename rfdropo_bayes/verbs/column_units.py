@@ -41,6 +41,7 @@ FOREIGN = {
 FORCE = re.compile(r"force|tension|load|(?<![a-z])[fn]\d|(?<![a-z])f_", re.IGNORECASE)
 ENCODER = re.compile(r"(?<![a-z])enc(oder)?(?![a-z])", re.IGNORECASE)
 PRESSURE = re.compile(r"(?<![a-z])pressures?(?![a-z])", re.IGNORECASE)
+SHORT_PRESSURE = re.compile(r"p_?\d+", re.IGNORECASE)  # or a pull: the motion must rule lengths out
 PASCALS_ABOVE, KILOPASCALS_ABOVE = 2e3, 10.0  # largest pressures in chambers of soft robots in kPa, and in bar
 ANGLES = ("rad", "deg", named_columns.COUNTS)
 ANGLE = re.compile(r"motor|servo|joint|theta|angle|(?<![a-z])q_?\d", re.IGNORECASE)
@@ -179,14 +180,18 @@ def command_unit(table: CsvTable, values: pd.DataFrame, names: Sequence[str]) ->
     if all(FORCE.search(name) for name in names):
         return Unit("N", evidence=f"{_span(names)} are called forces, and reach {largest:.3g}")
     if all(PRESSURE.search(name) for name in names):
-        unit = "Pa" if largest > PASCALS_ABOVE else "kPa" if largest > KILOPASCALS_ABOVE else "bar"
-        return Unit(unit, evidence=f"{_span(names)} reach {largest:.3g}")
+        return Unit(pressure_unit(largest), evidence=f"{_span(names)} reach {largest:.3g}")
     evidence = f"{_span(names)} reach {largest:.3g}"
     if all(pd.api.types.is_integer_dtype(values[name]) for name in names):
         evidence += " in whole numbers, as counts do"
         if largest > COUNTS_ABOVE or all(ENCODER.search(name) for name in names):
             return Unit(named_columns.COUNTS, evidence=evidence)
     return Unit("mm" if largest > METRES_UP_TO else "m", evidence=evidence)
+
+
+def pressure_unit(largest: float) -> str:
+    """The unit of pressures by the largest of them."""
+    return "Pa" if largest > PASCALS_ABOVE else "kPa" if largest > KILOPASCALS_ABOVE else "bar"
 
 
 def angle_unit(values: pd.DataFrame, names: Sequence[str]) -> Unit:

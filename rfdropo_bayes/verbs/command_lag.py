@@ -117,7 +117,7 @@ def _map_residuals(series: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[Flo
 
 def _quadratic(command: Float[np.ndarray, "row channel"]) -> Float[np.ndarray, "row feature"]:
     """Scaled commands, their positive parts, and the products of all pairs."""
-    size = np.sqrt(np.mean(command**2, axis=0))
+    size = np.sqrt(np.sum(command**2, axis=0) / max(len(command), 1))
     scaled = command / np.where(size > 0.0, size, 1.0)
     one, other = np.triu_indices(scaled.shape[1])
     return np.concatenate([scaled, np.maximum(scaled, 0.0), scaled[:, one] * scaled[:, other]], axis=1)

@@ -332,9 +332,14 @@ def _sentence(kind: str, outlook: DesignOutlook, now: dict[tuple[str, str], floa
         )
     pair = min(outlook.pairs, key=lambda p: outlook.pairs[p])
     words = " and ".join(name.replace("_", " ") for name in pair)
+    before, after = (f"{0.5 * ratio:.1f}" for ratio in (now[pair], outlook.pairs[pair]))
+    if before == after:
+        return (
+            f"No proposed experiment distinguishes {words}: beside the {kind} in {COMMANDS}, the best of them, the "
+            f"expected log likelihood ratio stays at {after} nats."
+        )
     return (
         f"Record the {kind} in {COMMANDS}: it raises the expected log likelihood ratio of the pair that "
-        f"is hardest to distinguish, {words}, from {0.5 * now[pair]:.1f} to "
-        f"{0.5 * outlook.pairs[pair]:.1f} nats, and identifies the right explanation with probability "
-        f"{outlook.right:.2f}."
+        f"is hardest to distinguish, {words}, from {before} to {after} nats, and identifies the right explanation with "
+        f"probability {outlook.right:.2f}."
     )

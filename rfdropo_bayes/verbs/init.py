@@ -25,7 +25,7 @@ from rfdropo_bayes.robots import Robot
 from rfdropo_bayes.robots.outline import RobotOutline, outlined_tables, robot_text
 from rfdropo_bayes.tables import parse_table
 from rfdropo_bayes.verbs.column_names import Guess, lost_positions, names_of
-from rfdropo_bayes.verbs.column_units import Unit, unit_of_places
+from rfdropo_bayes.verbs.column_units import SHORT_PRESSURE, Unit, pressure_unit, unit_of_places
 from rfdropo_bayes.verbs.command_lag import errors_by_row
 from rfdropo_bayes.verbs.days import Piece, days_of, group_lines, last_third, pieces_of
 from rfdropo_bayes.verbs.installation import DriveZero, installed_mechanisms, installed_priors, zero_of_drives
@@ -165,8 +165,8 @@ def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutlin
     """A guess and a robot with drives of another kind, if the motion shows that no unit of the guessed kind is right.
 
     Angles that no body bends by, of spools of unknown size, are millimetres of cable if these explain the motion.
-    Lengths that no name says are inputs of drives of unknown force, such as pressures, if they would bend the robot
-    much farther than its markers moved, even in millimetres.
+    Lengths that no name says are inputs of drives of unknown force if they would bend the robot much farther than its
+    markers moved, even in millimetres, or pressures if their names are p1, p2, ...
     """
     evidence = guess.evidence.get("command_unit", "")
     robot = parse_table(Robot, outlined_tables(outline), where="outline")
@@ -187,8 +187,14 @@ def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutlin
     words = bends_too_far(robot, METRES["mm"] * guess.sent, seen, heights)
     if words is None:
         return guess, outline
-    said = {**guess.evidence, "command_unit": f"{evidence}; {words}: drives of unknown force, such as pressures"}
-    return guess._replace(command_unit="-", evidence=said), replace(outline, command_unit="-")
+    if all(SHORT_PRESSURE.fullmatch(name) for name in guess.commands):
+        unit, meant = pressure_unit(float(np.nanmax(np.abs(guess.sent)))), "pressures, not lengths"
+        driven = replace(outline, command_unit="Pa", assumed=outline.assumed | {"area"})
+    else:
+        unit, meant = "-", "forces of unknown size that pull; --command-unit kPa makes them pressures that push"
+        driven = replace(outline, command_unit="-")
+    said = {**guess.evidence, "command_unit": f"{evidence}; {words}: {meant}"}
+    return guess._replace(command_unit=unit, evidence=said), driven
 
 
 def write_first_files(
@@ -305,7 +311,8 @@ def write_first_files(
             lines = moved_frame(columns, turned, -turned @ registration.frame.shift)
             frame = [f"{line}  # ASSUMED: {explained} in this frame" for line in lines]
             registration = registration._replace(frame=registration.frame._replace(shift=np.zeros(3)))
-    gain = float(np.clip(registration.bend / registration.softness, *FORCES))
+    force = 1.0 if outline.sets_bend == "area" else registration.bend / registration.softness
+    gain = float(np.clip(force, *FORCES))
     write(tables(guess=ordered, frame=frame, order=order), slow, first, registration.frame, gain)
     return robot, experiment, unread
 

@@ -30,8 +30,8 @@ TILT, TURN = 0.1, 0.5
 0.3 rad."""
 GAIN = 0.1  # standard deviation of the relative error of a command in metres of cable
 UNKNOWN = 0.5
-"""The same of a robot whose cables' distance from the axis, or whose length, was not given; and of pressures and inputs
-of drives, whose force per command no answer states."""
+"""The same of a robot whose cables' distance from the axis, or whose length, was not given; and of inputs of drives,
+whose force per command no answer states, as of pressures in chambers of unknown area."""
 
 
 class DriveZero(NamedTuple):
@@ -143,7 +143,8 @@ def installed_priors(
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
     if robot.command_unit in UNSTATED:
-        normal("command_gain_error", UNKNOWN * gain, "force of a drive over that of the robot file, less 1", gain - 1.0)
+        wide = GAIN if robot.command_unit == "Pa" and "area" not in assumed else UNKNOWN
+        normal("command_gain_error", wide * gain, "force of a drive over that of the robot file, less 1", gain - 1.0)
     if "length" in assumed:
         normal("camera_scale_error", UNKNOWN, "lengths over the robot file's lengths, less 1")
     if _pulled_by_section(robot) or _hardly_shortens(robot):

@@ -139,7 +139,8 @@ class _Sights:
         rows: rows of the recording.
         scaled: whether lengths may be scaled.
         bends: bends of a command to try.
-        stiff: whether the stiffness of a body that lies is unknown, so that its compliance is tried as well.
+        stiff: whether the stiffness is unknown: if forces move the body, a bend is that of a softer body, and if it
+            lies, its compliance is tried as well.
     """
 
     def __init__(self, robot: RestingRobot, rows: Rows, *, scaled: bool, bends: Sequence[float], stiff: bool) -> None:
@@ -150,7 +151,7 @@ class _Sights:
         self.held_by_force, self.modulus = own.held_by_force, own.nominal()["young_modulus"]
         # Of forces, the compliance alone sets both, unless the force of a command is not stated.
         tied, free = own.held_by_force and own.command_unit not in UNSTATED, self.lies and stiff
-        self.written = [(bend, bend if own.held_by_force else 1.0) for bend in bends]
+        self.written = [(bend, bend if own.held_by_force and stiff else 1.0) for bend in bends]
         self.soft = [1.0] if not free or tied else list(SOFTNESS)
         self.steps = [[SOFTER, SOFTER]] if tied else [[0.0, SOFTER], *([[SOFTER, 0.0]] * own.held_by_force)]
         self.steps = self.steps if free else []

@@ -331,12 +331,18 @@ def _drifts(fit: RestFit) -> list[str]:
 
 
 def _by_way(fit: RestFit) -> list[str]:
-    """The channel whose direction of motion explains most of the residual."""
+    """The channel whose direction of motion explains most of the residual, beside a parabola of its command: a command
+    that rose is high on average.
+    """
     residual = fit.residual[:, -1]
     whole = np.isfinite(residual).all(axis=1)
     if whole.sum() < 8:
         return []
-    residual, ways = residual[whole] - residual[whole].mean(axis=0), fit.ways[whole] - fit.ways[whole].mean(axis=0)
+    command = fit.rows.command[whole]
+    scaled = command / np.maximum(np.abs(command).max(axis=0), 1e-300)
+    shape = np.concatenate([np.ones((len(scaled), 1)), scaled, scaled**2], axis=1)
+    both = np.concatenate([residual[whole], fit.ways[whole]], axis=1)
+    residual, ways = np.split(both - shape @ np.linalg.lstsq(shape, both, rcond=None)[0], [residual.shape[1]], axis=1)
     size = np.maximum(np.sum(ways**2, axis=0), 1e-300)
     slope = ways.T @ residual / size[:, None]
     share = np.sum(slope**2, axis=1) * size / max(float(np.sum(residual**2)), 1e-300)

@@ -108,7 +108,12 @@ def test_without_repeats_an_error_that_lasts_is_held_against_the_best_baseline(r
     changed["error_correlation"]["test"] = {"middle": 0.0, "tip": 0.0}
     assert rate_safety(run.record, changed).verdict == "safe"
     changed["error_correlation"]["test"]["tip"] = 0.4
+    for row in changed["recordings"]:
+        row["rows"] = 100
     assert "at the tip" in rate_safety(run.record, changed).sentence
+    for row in changed["recordings"]:
+        row["rows"] = 10  # whose correlation is as large by chance
+    assert rate_safety(run.record, changed).verdict == "safe"
 
 
 def test_a_prior_that_excludes_the_data_is_said(run, summary):

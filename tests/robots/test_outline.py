@@ -151,7 +151,9 @@ def test_segments_of_disks_end_at_disks_of_their_own():
         Robot.outline(**given, length=0.2, segment_lengths=(0.199, 0.001))
 
 
-@pytest.mark.parametrize(("unit", "assumed"), [("rad", "spool_radius"), ("m", "cable_radius"), ("N", "young_modulus")])
+@pytest.mark.parametrize(
+    ("unit", "assumed"), [("rad", "spool_radius"), ("m", "cable_radius"), ("N", "young_modulus"), ("Pa", "area")]
+)
 def test_a_robot_of_another_size_bends_by_the_given_factor(unit, assumed):
     """Bend of a command: pull over the cables' distance, or tension times distance and length over the stiffness."""
     unknown = frozenset({"length", "radius", "markers", assumed})
@@ -161,6 +163,8 @@ def test_a_robot_of_another_size_bends_by_the_given_factor(unit, assumed):
     def bend(o: RobotOutline) -> float:
         if unit == "N":
             return o.arm * o.length / (o.young_modulus * o.radius**4)
+        if unit == "Pa":
+            return o.chamber_area * o.arm * o.length / o.radius**4
         return (o.spool_radius if unit == "rad" else 1.0) / o.arm
 
     assert small.sets_bend == assumed

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import rfdropo_bayes as rb
 from rfdropo_bayes.cli import main
 from rfdropo_bayes.data import load_recordings
 from rfdropo_bayes.errors import InputError
@@ -649,13 +650,46 @@ def test_pressures_make_chambers(tmp_path, monkeypatch, capsys):
     assert init(monkeypatch, capsys, "b", "--recording", "air.csv")[0] == 0
     robot = Robot.load(tmp_path / "b" / "b.toml")
     assert (robot.command_unit, robot.cables, len(robot.chambers)) == ("Pa", (), 4)
-    assert "ASSUMED: their area" in (tmp_path / "b" / "b.toml").read_text()
+    assert "# ASSUMED: area" in (tmp_path / "b" / "b.toml").read_text()
     experiment, _ = load_experiment(tmp_path / "b" / "experiment.toml")
     (recording,) = load_recordings(experiment.data, tmp_path / "b")
     assert (recording.command_unit, robot.usual_command) == (
         "Pa",
         pytest.approx(np.abs(recording.command).max(), rel=0.01),
     )
+
+
+def test_pressures_of_short_names_move_chambers_whose_area_the_motion_shows(tmp_path, monkeypatch, capsys):
+    """Poses under p1, p2, p3 of 60 kPa, whose unit no name tells: lengths of 60 mm would bend the arm far more. A fifth
+    of the body's radius makes chambers of 25 mm2; true are 60. An area that is stated stays."""
+    known = {"length": 0.18, "radius": 0.014, "cables": 3, "cable_radius": 0.008, "mass": 0.1, "young_modulus": 3.5e5}
+    arm = Robot.outline(name="arm", command_unit="Pa", area=6e-5, markers={"mid": 0.09, "tip": 0.18}, **known)
+    rng, time = np.random.default_rng(0), np.arange(40.0)
+    blank = rb.Trajectory.from_arrays(
+        time=time,
+        position=np.tile(arm.marker_points(), (40, 1, 1)),
+        command=rng.uniform(0.0, 60e3, (40, 3)),
+        command_time=time - 0.5,
+        markers=arm.marker_names,
+        channels=arm.channel_names,
+        command_unit="Pa",
+        name="run",
+    )
+    (run,) = rb.simulate(rb.Model(arm, priors={"young_modulus": {}}, simulator={"motion": "quasi-static"}), [blank])
+    table = pd.DataFrame(1e-3 * run.command, columns=["p1", "p2", "p3"])
+    for k, marker in enumerate(("mid", "tip")):
+        table[[f"{marker}_{axis}" for axis in "xyz"]] = 1e3 * run.position[:, k]
+    table.to_csv(tmp_path / "run.csv", index=False)
+    monkeypatch.chdir(tmp_path)
+    told = ["--recording", "run.csv", "--markers", "mid=90,tip=180", "--length-mm", "180", "--radius-mm", "14"]
+    told += ["--cables", "3", "--cable-radius-mm", "8", "--mass-g", "100", "--modulus-mpa", "0.35"]
+    status, output = init(monkeypatch, capsys, "a", *told)
+    assert status == 0
+    assert 'command_unit = "kPa"' in output
+    assert "pressures, not lengths" in output
+    assert Robot.load(tmp_path / "a" / "a.toml").chambers[0].area_m2 == pytest.approx(6e-5, rel=0.2)  # factors of 1.4
+    assert init(monkeypatch, capsys, "b", *told, "--command-unit", "kPa", "--chamber-area-mm2", "30")[0] == 0
+    assert Robot.load(tmp_path / "b" / "b.toml").chambers[0].area_m2 == pytest.approx(3e-5)
 
 
 def test_disks_that_nobody_counted_share_out_over_the_segments(tmp_path, monkeypatch, capsys):

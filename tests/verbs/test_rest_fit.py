@@ -81,6 +81,9 @@ def test_what_is_left_is_told_from_its_form():
     assert any("drifts by" in note for note in rest_notes(fit._replace(residual=drifting)))
     rubbing = fit.residual + 1e-3 * fit.ways[:, 1, None, None]
     assert any("commands 2 that rose" in note for note in rest_notes(fit._replace(residual=rubbing)))
+    # A command that rose is a high one in most rows: a slope over it is no friction.
+    sloping = fit.residual + 1e-3 * (fit.rows.command[:, 1] / np.ptp(fit.rows.command[:, 1]))[:, None, None]
+    assert not any("that rose" in note for note in rest_notes(fit._replace(residual=sloping)))
     worse = fit._replace(unseen={**fit.unseen, OWN: 1.0})
     assert any("without any physics" in note for note in rest_notes(worse._replace(tested=True)))
     assert rest_notes(worse) == []  # regressions on their own rows are no measure
