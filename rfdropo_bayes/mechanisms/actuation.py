@@ -164,8 +164,8 @@ class ActuatorLag(SteppedActuation):
     name = "actuator_lag"
     stage = "actuation"
     inside_drive = True
-    cause = "bandwidth of the position loop of the drives"
-    remedy = "stiffen the position loop, or keep the lag in the model"
+    cause = "bandwidth of the position loop of the drives, or of valves and their lines"
+    remedy = "stiffen the position loop, shorten the lines, or keep the lag in the model"
     parameters: tuple[ParameterSpec, ...] = (
         ParameterSpec("actuator_lag", "s", 0.0, 5.0, 0.0, half_normal(0.2), "time constant of the lag"),
     )
@@ -189,7 +189,7 @@ class CableLag(PerChannel, ActuatorLag):
     """Each drive follows with a first-order lag of its own; zero at null. Equal lags of all are `actuator_lag`'s."""
 
     name = "cable_lag"
-    cause = "a drive that follows more slowly than others: its load, its gains, or friction of its cable"
+    cause = "a drive that follows more slowly than others: its load, its gains, friction of its cable, or its valve"
     remedy = "step each drive alone, and compare the rise of their encoders"
     size = ParameterSpec("cable_lag", "s", 0.0, 5.0, 0.0, half_normal(0.2), "time constant")
 
@@ -203,8 +203,8 @@ class CommandGain(MemorylessActuation):
     name = "command_gain"
     stage = "actuation"
     inside_drive = True
-    cause = "wrong spool radius or transmission ratio, or cable stretch proportional to travel"
-    remedy = "measure the cable travel of one motor turn"
+    cause = "wrong spool radius or transmission ratio, cable stretch proportional to travel, or wrong area of chambers"
+    remedy = "measure the cable travel of one motor turn, or the pressure in the chambers"
     parameters = (
         ParameterSpec(
             "command_gain_error", "-", -0.9, 2.0, 0.0, normal(0.2), "relative error of the commanded displacement"
@@ -222,8 +222,8 @@ class CableGain(PerChannel, MemorylessActuation):
     name = "cable_gain"
     stage = "actuation"
     inside_drive = False
-    cause = "spools of different radius, cables of different stretch, or a cable that slips or is torn"
-    remedy = "measure how far each cable travels for the same command"
+    cause = "spools of different radius, cables that stretch, slip or are torn, or chambers that leak or differ in area"
+    remedy = "measure how far each cable travels, or the pressure in each chamber, for the same command"
     # At -1 a cable does not pull at all.
     size = ParameterSpec("cable_gain_error", "-", -1.0, 2.0, 0.0, normal(0.2), "relative error of the displacement")
 

@@ -58,6 +58,7 @@ PILOT_SHARE = 0.6  # share of the budget of optimisations that a pilot run may t
 PILOT_PREFIXES = 2  # number of last prefixes whose particles start optimisations; the same number of horizons follows
 PILOT_MOVES = 8  # of a stage, at most: optimisations need a start in the right basins, not a fair sample of them
 FEWEST_STEPS = 4.0  # of an optimisation that is worth its start
+NEARLY = 0.9  # of the budget: an optimisation that ends beyond it wants rollouts, since a step takes tens of them
 
 
 @dataclass(frozen=True, repr=False)
@@ -180,7 +181,7 @@ def find_modes(
         logbook.part(PILOT_SHARE * (config.pilot_particles > 0), 1.0).stage(share, method="laplace", **search.trace[-1])
     assert search.noise is not None
     matter = search.log_density > search.log_density.max() - ALTERNATIVE if chosen is None else chosen(search)
-    return _collect(search, target_at(problem.n_rows, search.ledger, search.positions[0], search.noise), matter)
+    return _collect(search, target_at(problem.n_rows, search.ledger, search.positions[0], search.noise), matter, config)
 
 
 def starts_of_draws(
@@ -478,7 +479,9 @@ def _affordable_steps(
     return int(np.clip((rows / served - grid) / step, 0, config.max_steps))
 
 
-def _collect(search: Optimisations, target: Optimisable, matter: Bool[np.ndarray, " start"]) -> Modes:
+def _collect(
+    search: Optimisations, target: Optimisable, matter: Bool[np.ndarray, " start"], config: LaplaceConfig
+) -> Modes:
     """Laplace at every optimum that could matter, in the order of their evidence."""
     modes: list[Laplace] = []
     for index in np.argsort(-search.log_density, kind="stable"):
@@ -490,15 +493,15 @@ def _collect(search: Optimisations, target: Optimisable, matter: Bool[np.ndarray
             modes += [mode] if _apart(mode.mean, modes) else []
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(search.positions - modes[0].mean), axis=1))
-    return Modes(modes, search, _unfinished(bool(search.converged[best])))
+    return Modes(modes, search, _unfinished(bool(search.converged[best]), search.ledger, config))
 
 
-def _unfinished(converged: bool) -> list[Caution]:
-    """A caution if the best optimisation has not converged."""
-    sentence = (
-        "the best optimisation had not converged when its steps or its budget ran out; raise minutes, or rollouts and "
-        "max_steps, in [inference]"
-    )
+def _unfinished(converged: bool, ledger: Ledger, config: LaplaceConfig) -> list[Caution]:
+    """A caution if the best optimisation has not converged, for want of steps or of rollouts."""
+    ended, more = f"after max_steps = {config.max_steps}", "max_steps"
+    if config.rollouts is not None and ledger.rollouts > NEARLY * config.rollouts:
+        ended, more = "when its budget ran out", "minutes or rollouts"
+    sentence = f"the best optimisation had not converged {ended}; raise {more} in [inference]"
     return [] if converged else [Caution(Code.OPTIMISATION_UNFINISHED, sentence, grave=True)]
 
 
@@ -657,7 +660,7 @@ def _counted(problem: Problem, optima: Modes, config: LaplaceConfig) -> tuple[Pr
     moved.sort(key=lambda each: -each[0].log_evidence)
     again = lasting_residuals(counted, target, moved[0][0])
     lasting = {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
-    return counted, Modes([mode for mode, _ in moved], search, _unfinished(moved[0][1])), lasting
+    return counted, Modes([mode for mode, _ in moved], search, _unfinished(moved[0][1], search.ledger, config)), lasting
 
 
 def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:
