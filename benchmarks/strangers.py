@@ -252,7 +252,7 @@ def record_in_mujoco(own: Laboratory, effect: str, seed: int) -> Recorded | None
     runs = rb.simulate(plain, own.walk, parameters=base, seed=seed)
     along = base["young_modulus"] * np.pi * own.outline["radius"] ** 2 / own.outline["length"]
     values = base | {"trunk_mass": own.outline["mass"], "rayleigh_stiffness": own.damping}
-    hidden, size = IN_MUJOCO.get(effect), 0.0
+    hidden, size = None if effect == NOTHING else IN_MUJOCO[effect], 0.0
     arm = MuJoCoArm(own.robot, values, hidden, links=LINKS, step=STEP, cable_stiffness=TAUT * along, settled=True)
     share = 0.0
     if hidden is not None:
@@ -450,10 +450,11 @@ def main() -> None:
     """Run the seeds that the ledger does not have yet, and write its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("seeds", nargs="+", type=int, metavar="SEED")
-    parser.add_argument(
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument(
         "--at-rest", dest="kind", action="store_const", const="at_rest", default="motion", help="poses without times"
     )
-    parser.add_argument("--mujoco", dest="kind", action="store_const", const="mujoco", help="arms that MuJoCo moves")
+    kinds.add_argument("--mujoco", dest="kind", action="store_const", const="mujoco", help="arms that MuJoCo moves")
     parser.add_argument("--out", type=Path, help="reports/strangers/motion, at_rest or mujoco by default")
     parser.add_argument("--runs", type=Path, default=Path("runs/strangers"))
     given = parser.parse_args()

@@ -375,6 +375,9 @@ class MuJoCoArm(EngineArm):
             mujoco.mj_step(model, data, nstep=round(0.05 / self.step))
             if np.abs(data.site_xpos[markers] - before).max() < STILL:
                 break
+        else:
+            if self.settled:
+                raise InputError(f"no rest within {LONGEST:g} s", where=recording.name, remedy="damp the arm more")
         for row, level in enumerate(held):
             mujoco.mj_kinematics(model, data)
             path[row] = data.site_xpos[markers]

@@ -262,7 +262,7 @@ def init(
     answers["cables"], answers["pairs"] = _cables(ask, guess, answers["segments"], cables, pairs)
     if unit in (*ANGLES, "N m"):
         answers["spool_radius"] = ask.answer("spool_radius", spool_radius, "Radius of the spools [mm]", 10.0)
-    if unit in PASCALS:
+    if unit in PASCALS or chamber_area is not None:
         words = "Area of a chamber across the axis [mm2]; 0 if unknown"
         answers["area"] = ask.answer("area", chamber_area, words, 0.0) or None
     answers["gravity"] = ask.answer("gravity", gravity, "Things fall along (+z: hangs, -z: stands, -y: level)", "+z")

@@ -16,6 +16,7 @@ SHARE = 0.75
 POSE = "pose"  # the statistic of what depends on the predicted pose, see `pose_regressors`
 BLOCK = 10  # rows
 LAGS = 10
+STILL = 1e-6  # of the largest motion along an axis, below which motion along another is rounding
 
 
 @dataclass(frozen=True)
@@ -85,23 +86,30 @@ def block_squares(
 
 
 def pose_regressors(
-    position: Float[np.ndarray, "group time marker 3"], valid: Bool[np.ndarray, "group time column"]
+    position: Float[np.ndarray, "group time marker 3"],
+    time: Float[np.ndarray, "group time"],
+    valid: Bool[np.ndarray, "group time column"],
 ) -> Float[np.ndarray, "regressor group time column"]:
     """Errors of each coordinate that depend on the predicted pose: a shift, a drift, an affine map of the pose, and its
-    rate, the same for all markers.
+    rate, the same for all markers and recordings.
 
     A model with a wrong cause that predicts nearly as well leaves little, and leaves it there; a test that asks for any
     pattern does not see it. That errors must not depend on predictions is the idea of Ramsey's RESET (1969). Measured
     positions would not do: their noise is in the errors as well.
     """
     usable = valid.reshape(position.shape)
-    mean = np.mean(position, axis=(0, 1, 2), where=usable, keepdims=True)
-    rate = np.diff(position, axis=1, prepend=position[:, :1])
+    count = np.maximum(np.sum(usable, axis=(0, 1, 2)), 1)
+    around = position - np.sum(position, axis=(0, 1, 2), where=usable) / count
+    spread = np.sqrt(np.sum(around**2, axis=(0, 1, 2), where=usable) / count)
+    around = np.where(spread > STILL * spread.max(), around, 0.0)
+    step = np.diff(time, axis=1, prepend=time[:, :1])[..., None, None]
+    change = np.diff(around, axis=1, prepend=around[:, :1])
+    rate = np.divide(change, step, out=np.zeros_like(change), where=step > 0.0)
     drift = np.broadcast_to(np.linspace(-1.0, 1.0, position.shape[1])[:, None, None], usable.shape)
     found = []
     for axis, unit in enumerate(np.eye(3)):
         found += [part * unit for part in (np.ones(usable.shape), drift, rate)]
-        found += [np.where(np.arange(3) == axis, (position - mean)[..., [k]], 0.0) for k in range(3)]
+        found += [np.where(np.arange(3) == axis, around[..., [k]], 0.0) for k in range(3)]
     return np.stack([np.where(usable, each, 0.0).reshape(valid.shape) for each in found])
 
 

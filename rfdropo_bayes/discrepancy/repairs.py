@@ -180,14 +180,14 @@ def without(search: ExtensionSearch, steps: Sequence[Added], index: int, base: F
     assert candidate is not None
     gone = np.setdiff1d(candidate.indices, steps[index - 1].fit.free if index else base.free)
     kept, fit_targets = list(steps[:index]), [step.fit_target for step in steps[: index + 1]]
-    # The next step now follows the model before the dropped step, with the tests and refits beside that model. If the
-    # dropped step had taken the place of another, these have its rivals alone, and the next step keeps its own.
+    # The next step now follows the model before the dropped step, with the tests and refits beside that model. A step
+    # that had taken the place of another was tested beside its rivals alone.
     dropped, following = steps[index], list(steps[index + 1 :][:1])
-    tested = {row.name for row in dropped.before.rows}
-    following = [
-        replace(step, before=dropped.before, refits=dropped.refits) if step.name in tested else step
-        for step in following
-    ]
+    if following and following[0].name in {row.name for row in dropped.before.rows}:
+        following = [replace(following[0], before=dropped.before, refits=dropped.refits)]
+    elif following:
+        again = search.score_tests(kept[-1].fit if kept else base, [step.name for step in kept])
+        following = [replace(following[0], before=again)]
     for step in [*following, *steps[index + 2 :]]:
         before, start = kept[-1].fit if kept else base, step.fit.x.copy()
         start[gone] = null[gone]

@@ -1,8 +1,8 @@
 """Score tests of a model: a joint test of its residuals, and a test of each candidate.
 
 All p-values come from a parametric bootstrap: residuals are simulated under a right model. Noise is drawn for every
-recording, the noise model is estimated as for the data, and the base model is refitted linearly. No rollouts are
-needed but the one of the prediction.
+recording, the noise model is estimated as for the data, and the base model is refitted linearly. One
+prediction is rolled out.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from rfdropo_bayes.discrepancy.score import Signature, project_out, signature, s
 from rfdropo_bayes.discrepancy.unknown_size import linear_evidence
 
 CHUNK_NUMBERS = 2e7  # of simulated residuals in memory at a time
-SEEN = 0.01  # of a regressor's norm, below which base parameters imitate it
+IMITATED = 0.01  # of a regressor's norm: base parameters imitate it if they leave less
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,10 @@ def _of_the_pose(target: FitTarget, fit: Fit, base: Float[np.ndarray, "n rank"])
     shown = target.recall("shown", [fit.x], lambda: {"position": target.forward.observe_one(fit.x)["position"]})
     position = shown["position"].reshape(groups, -1, measured.markers // 3, 3)[:, :rows]
     errors = np.zeros((6 * 3, *measured.count.shape))
-    errors[..., : measured.markers] = pose_regressors(position, measured.valid[..., : measured.markers])
+    errors[..., : measured.markers] = pose_regressors(position, measured.time, measured.valid[..., : measured.markers])
     columns = np.zeros((measured.size, len(errors)))
     columns[: measured.count.size] = measured.whiten(errors, target.noise).T
-    return signature(base, columns / np.maximum(SEEN * np.linalg.norm(columns, axis=0), np.finfo(float).tiny))
+    return signature(base, columns / np.maximum(IMITATED * np.linalg.norm(columns, axis=0), np.finfo(float).tiny))
 
 
 def _statistics(

@@ -338,7 +338,11 @@ def _pattern(answer: Answer) -> str:
     """Clause about an extended model that fails the joint test."""
     rules, omnibus = answer.problem.rules, answer.test_series[-1].omnibus
     last, single = omnibus.p, omnibus.single
-    follows = " that follows the pose" if single[POSE] < min(p for name, p in single.items() if name != POSE) else ""
+    follows = (
+        " of a shift, a drift or the pose"
+        if single[POSE] < min(p for name, p in single.items() if name != POSE)
+        else ""
+    )
     words = f"the fitted recordings keep a pattern{follows} (joint test p {p_in_words(last, rules.bootstraps)})"
     if last > rules.level or _only_noise(answer):
         return words

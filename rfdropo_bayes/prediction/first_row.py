@@ -114,7 +114,8 @@ def resampled_by_first_row(
 
 
 def first_row_distances(predictions: Sequence[RecordingPrediction], model_error: ModelError | None) -> dict[str, float]:
-    """Distance of measured from predicted first rows in units of the model error, if it exceeds chance among all rows.
+    """Distance of measured from predicted first rows in units of the model error, if it exceeds chance among
+    the first rows of all recordings.
 
     Errors of a row are assumed normal, with the sizes and the number of independent coordinates of the residuals
     (`ModelError.share`).

@@ -107,7 +107,7 @@ def _objects(summary: Mapping[str, Any]) -> str:
 def _bounds(summary: Mapping[str, Any]) -> str:
     names = [name for name, row in summary["parameters"].items() if row["at_bound"]]
     if not names:
-        return "No parameter sits on a hard bound."
+        return "No parameter is piled up at a hard bound or an end of its prior."
     verb = "sits" if len(names) == 1 else "sit"
     return f"Careful: {', '.join(names)} {verb} on a hard bound or at an end of the prior, which decides, not the data."
 

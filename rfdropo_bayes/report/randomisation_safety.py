@@ -136,11 +136,12 @@ def _beyond_fitted(summary: Mapping[str, Any], errors: Mapping[str, float]) -> l
 
 def _near_baselines(summary: Mapping[str, Any], errors: Mapping[str, float]) -> list[str]:
     """Markers whose error, without its noise, is most of the best baseline's. Noise is the spread between repeats or,
-    without repeats, the uncorrelated share of the squared error; the correlation of as many rows of noise is no more
-    than twice its standard error.
+    without repeats, the uncorrelated share of the squared error. A correlation below two standard errors counts as
+    zero, unless it is above a half.
     """
     floor, correlation, places = summary["noise_floor_mm"] or {}, summary["error_correlation"]["test"], []
-    chance = 2.0 / np.sqrt(max(sum(row["rows"] for row in summary["recordings"] if row["split"] == "test"), 1))
+    rows = sum(row["rows"] for row in summary["recordings"] if row["split"] == "test")
+    chance = min(HALF, 2.0 / np.sqrt(max(rows, 1)))
     for marker, error in errors.items():
         best, lasting = best_baseline(summary, "test", marker), correlation[marker] or 0.0
         noise = floor[marker] ** 2 if floor.get(marker) else error**2 * (1.0 - (lasting if lasting > chance else 0.0))

@@ -81,9 +81,9 @@ class RobotOutline:
             )
         if self.shape not in SHAPES:
             raise InputError(f"unknown shape {self.shape!r}", where=where, remedy=f"use one of {', '.join(SHAPES)}")
-        for key in ("length", "radius", "young_modulus", "spool_radius"):
-            if not getattr(self, key) > 0.0:
-                raise InputError(f"{key} = {getattr(self, key):g} is not positive", where=where)
+        for key in ("length", "radius", "young_modulus", "spool_radius", "area"):
+            if (size := getattr(self, key)) is not None and not size > 0.0:
+                raise InputError(f"{key} = {size:g} is not positive", where=where)
         if self.segments < 1 or self.cables < 1:
             raise InputError("an arm has one segment and one cable at least", where=where)
         given = self.segment_lengths
@@ -238,7 +238,7 @@ class RobotOutline:
     @property
     def chamber_area(self) -> float:
         """Area of a chamber across the axis [m2]."""
-        return self.area or np.pi * (CHAMBER_RADIUS * self.inside) ** 2
+        return np.pi * (CHAMBER_RADIUS * self.inside) ** 2 if self.area is None else self.area
 
     @property
     def newtons(self) -> float:

@@ -49,8 +49,7 @@ AIMED = re.compile(r"goal|target|desired|(?<![a-z])(ref|reference|set)(?![a-z])"
 """What a controller aims at: a command of its drives, or in x, y and z a place that the robot should reach."""
 SENT = re.compile(rf"cmd|command|action|setpoint|{AIMED.pattern}", re.IGNORECASE)
 COMMAND = re.compile(
-    rf"{SENT.pattern}|motor|servo|pressure|chamber|pull|cable|tendon|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)",
-    re.IGNORECASE,
+    rf"{SENT.pattern}|motor|servo|pull|cable|tendon|ref|theta|angle|(?<![a-z])[aucqm](_?\d|\[|$)", re.IGNORECASE
 )
 NO_COMMAND = re.compile(
     r"(?<![a-z])(ids?|idx|index|frames?|seq|rows?|numbers?|nr|trial|episode|run|phase|pattern|label|flags?|status|mode|"
@@ -385,6 +384,7 @@ def _commands(table: pd.DataFrame, names: list[str], measured: list[str], *, any
         [name for name in names if sent and not RATE.search(name)]
         or max(others, aims, key=len)
         or called
+        or [name for name in names if PRESSURE.search(name)]
         or ([name for name in names if not BESIDE.search(name)] if any_name else [])
         or measured
         or (names if any_name else [])
@@ -449,7 +449,7 @@ def _array_triples(names: list[str]) -> dict[str, list[str]]:
         arrays.setdefault(name.partition("[")[0], []).append(name)
     triples = _triples(names)
     for array, columns in arrays.items():
-        other = any(pattern.search(f"{array}[") for pattern in (COMMAND, SENT, FORCE, MEASURED, NO_COMMAND))
+        other = any(pattern.search(f"{array}[") for pattern in (COMMAND, SENT, FORCE, PRESSURE, MEASURED, NO_COMMAND))
         if len(columns) % 3 or other or any(name in triple for triple in triples.values() for name in columns):
             continue
         for k in range(0, len(columns), 3):

@@ -335,7 +335,7 @@ def _sentence(kind: str, outlook: DesignOutlook, now: dict[tuple[str, str], floa
     before, after = (f"{0.5 * ratio:.1f}" for ratio in (now[pair], outlook.pairs[pair]))
     if before == after:
         return (
-            f"No proposed experiment distinguishes {words}: beside the {kind} in {COMMANDS}, the best of them, the "
+            f"No proposed experiment separates {words} further: with the {kind} in {COMMANDS}, the best of them, the "
             f"expected log likelihood ratio stays at {after} nats."
         )
     return (

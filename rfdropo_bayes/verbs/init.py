@@ -166,7 +166,7 @@ def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutlin
 
     Angles that no body bends by, of spools of unknown size, are millimetres of cable if these explain the motion.
     Lengths that no name says are inputs of drives of unknown force if they would bend the robot much farther than its
-    markers moved, even in millimetres, or pressures if their names are p1, p2, ...
+    markers moved, even in millimetres. If their names are p1, p2, ..., they are pressures then.
     """
     evidence = guess.evidence.get("command_unit", "")
     robot = parse_table(Robot, outlined_tables(outline), where="outline")
@@ -189,7 +189,8 @@ def with_drives(guess: Guess, outline: RobotOutline) -> tuple[Guess, RobotOutlin
         return guess, outline
     if all(SHORT_PRESSURE.fullmatch(name) for name in guess.commands):
         unit, meant = pressure_unit(float(np.nanmax(np.abs(guess.sent)))), "pressures, not lengths"
-        driven = replace(outline, command_unit="Pa", assumed=outline.assumed | {"area"})
+        assumed = outline.assumed | ({"area"} if outline.area is None else set())
+        driven = replace(outline, command_unit="Pa", assumed=assumed)
     else:
         unit, meant = "-", "forces of unknown size that pull; --command-unit kPa makes them pressures that push"
         driven = replace(outline, command_unit="-")

@@ -143,7 +143,8 @@ def installed_priors(
         wide = UNKNOWN if "cable_radius" in assumed else GAIN
         normal("command_gain_error", wide, "travel of a cable over its command, less 1")
     if robot.command_unit in UNSTATED:
-        wide = GAIN if robot.command_unit == "Pa" and "area" not in assumed else UNKNOWN
+        stated = robot.command_unit == "Pa" and "area" not in assumed and gain == 1.0
+        wide = GAIN if stated else UNKNOWN
         normal("command_gain_error", wide * gain, "force of a drive over that of the robot file, less 1", gain - 1.0)
     if "length" in assumed:
         normal("camera_scale_error", UNKNOWN, "lengths over the robot file's lengths, less 1")

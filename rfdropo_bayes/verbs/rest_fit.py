@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.stats import f as ratio_of_variances
 
 from rfdropo_bayes.bayes.scopes import Scopes
 from rfdropo_bayes.data import Trajectory, group_repeats, shared_markers
@@ -29,6 +30,7 @@ MISREAD = 2.0
 """Error over that of the best predictor without physics at or above which the description itself is doubted."""
 DRIFTS, WAYS = 0.25, 0.1
 """Least shares of the residuals that a drift, and the direction of a command's last change, must explain."""
+CHANCE = 1e-3  # largest probability of such a share of white residuals
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg")}
 
 FITTED, SHOWN = 60, 240  # rows that are fitted, and rows whose residuals are shown
@@ -336,9 +338,10 @@ def _by_way(fit: RestFit) -> list[str]:
     """
     residual = fit.residual[:, -1]
     whole = np.isfinite(residual).all(axis=1)
-    if whole.sum() < 8:
-        return []
     command = fit.rows.command[whole]
+    freedom = len(command) - 1 - 2 * command.shape[1]
+    if freedom < 8:
+        return []
     scaled = command / np.maximum(np.abs(command).max(axis=0), 1e-300)
     shape = np.concatenate([np.ones((len(scaled), 1)), scaled, scaled**2], axis=1)
     both = np.concatenate([residual[whole], fit.ways[whole]], axis=1)
@@ -347,7 +350,11 @@ def _by_way(fit: RestFit) -> list[str]:
     slope = ways.T @ residual / size[:, None]
     share = np.sum(slope**2, axis=1) * size / max(float(np.sum(residual**2)), 1e-300)
     most = int(np.argmax(share))
-    if share[most] < WAYS:
+    times = share[most] / max(1.0 - share[most], 1e-300) * (freedom - 1)
+    chance = min(
+        1.0, ratio_of_variances.sf(times, 3, 3 * (freedom - 1)) * len(share)
+    )  # of white residuals, at any channel
+    if share[most] < WAYS or chance > CHANCE:
         return []
     apart = _millimetres(2.0 * float(np.linalg.norm(slope[most])))
     return [f"poses differ by {apart} mm between commands {most + 1} that rose and that fell: friction or backlash"]

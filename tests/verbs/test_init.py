@@ -644,6 +644,14 @@ def test_commands_that_are_no_travel_pull_by_a_force_of_unknown_size(tmp_path, m
     assert load_recordings(experiment.data, tmp_path / "arm")[0].command_unit == "-"
 
 
+@pytest.mark.parametrize(("command", "beside"), [("servo{0}", "supply_pressure"), ("pressure_{0}", "temperature")])
+def test_pressures_are_commands_if_nothing_else_is(tmp_path, command, beside):
+    run = table("t", "{marker}_{axis}", command)
+    run[beside] = 600.0
+    run.to_csv(tmp_path / "run.csv", index=False)
+    assert guess_columns(tmp_path / "run.csv").commands == [command.format(k) for k in range(1, 5)]
+
+
 def test_pressures_make_chambers(tmp_path, monkeypatch, capsys):
     table("t", "{marker}_{axis}", "valve{0}_bar").to_csv(tmp_path / "air.csv", index=False)
     monkeypatch.chdir(tmp_path)
@@ -688,8 +696,9 @@ def test_pressures_of_short_names_move_chambers_whose_area_the_motion_shows(tmp_
     assert 'command_unit = "kPa"' in output
     assert "pressures, not lengths" in output
     assert Robot.load(tmp_path / "a" / "a.toml").chambers[0].area_m2 == pytest.approx(6e-5, rel=0.2)  # factors of 1.4
-    assert init(monkeypatch, capsys, "b", *told, "--command-unit", "kPa", "--chamber-area-mm2", "30")[0] == 0
+    assert init(monkeypatch, capsys, "b", *told, "--chamber-area-mm2", "30")[0] == 0
     assert Robot.load(tmp_path / "b" / "b.toml").chambers[0].area_m2 == pytest.approx(3e-5)
+    assert "ASSUMED: area" not in (tmp_path / "b" / "b.toml").read_text(encoding="utf-8")
 
 
 def test_disks_that_nobody_counted_share_out_over_the_segments(tmp_path, monkeypatch, capsys):

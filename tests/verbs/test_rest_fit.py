@@ -81,6 +81,9 @@ def test_what_is_left_is_told_from_its_form():
     assert any("drifts by" in note for note in rest_notes(fit._replace(residual=drifting)))
     rubbing = fit.residual + 1e-3 * fit.ways[:, 1, None, None]
     assert any("commands 2 that rose" in note for note in rest_notes(fit._replace(residual=rubbing)))
+    few = fit._replace(rows=fit.rows.of(np.arange(16)), ways=fit.ways[:16], recording=fit.recording[:16])
+    noise = 1e-4 * np.random.default_rng(0).normal(size=(16, *fit.residual.shape[1:]))
+    assert not any("that rose" in note for note in rest_notes(few._replace(residual=noise)))
     # A command that rose is a high one in most rows: a slope over it is no friction.
     sloping = fit.residual + 1e-3 * (fit.rows.command[:, 1] / np.ptp(fit.rows.command[:, 1]))[:, None, None]
     assert not any("that rose" in note for note in rest_notes(fit._replace(residual=sloping)))

@@ -58,7 +58,6 @@ PILOT_SHARE = 0.6  # share of the budget of optimisations that a pilot run may t
 PILOT_PREFIXES = 2  # number of last prefixes whose particles start optimisations; the same number of horizons follows
 PILOT_MOVES = 8  # of a stage, at most: optimisations need a start in the right basins, not a fair sample of them
 FEWEST_STEPS = 4.0  # of an optimisation that is worth its start
-NEARLY = 0.9  # of the budget: an optimisation that ends beyond it wants rollouts, since a step takes tens of them
 
 
 @dataclass(frozen=True, repr=False)
@@ -493,13 +492,13 @@ def _collect(
             modes += [mode] if _apart(mode.mean, modes) else []
     modes.sort(key=lambda mode: -mode.log_evidence)
     best = np.argmin(np.max(np.abs(search.positions - modes[0].mean), axis=1))
-    return Modes(modes, search, _unfinished(bool(search.converged[best]), search.ledger, config))
+    return Modes(modes, search, _unfinished(bool(search.converged[best]), search.trace[-1]["steps"], config))
 
 
-def _unfinished(converged: bool, ledger: Ledger, config: LaplaceConfig) -> list[Caution]:
-    """A caution if the best optimisation has not converged, for want of steps or of rollouts."""
+def _unfinished(converged: bool, steps: int, config: LaplaceConfig) -> list[Caution]:
+    """A caution if the best optimisation has not converged, for want of steps or of rollouts for them."""
     ended, more = f"after max_steps = {config.max_steps}", "max_steps"
-    if config.rollouts is not None and ledger.rollouts > NEARLY * config.rollouts:
+    if steps < config.max_steps:
         ended, more = "when its budget ran out", "minutes or rollouts"
     sentence = f"the best optimisation had not converged {ended}; raise {more} in [inference]"
     return [] if converged else [Caution(Code.OPTIMISATION_UNFINISHED, sentence, grave=True)]
@@ -660,7 +659,7 @@ def _counted(problem: Problem, optima: Modes, config: LaplaceConfig) -> tuple[Pr
     moved.sort(key=lambda each: -each[0].log_evidence)
     again = lasting_residuals(counted, target, moved[0][0])
     lasting = {name: each._replace(widened=again[name].widened) for name, each in lasting.items()}
-    return counted, Modes([mode for mode, _ in moved], search, _unfinished(moved[0][1], search.ledger, config)), lasting
+    return counted, Modes([mode for mode, _ in moved], search, _unfinished(moved[0][1], steps, config)), lasting
 
 
 def mode_values(problem: Problem, mode: Laplace) -> dict[str, float]:
