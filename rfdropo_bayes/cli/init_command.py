@@ -32,12 +32,8 @@ FOUND = (
 MODELS = (".xml", ".urdf")  # suffixes of models of other simulators, see `simulators.adapters`
 MILLIMETRES = 1e-3
 LENGTHS = ("length", "radius", "tip_radius", "inner_radius", "cable_radius", "spool_radius")
-FACTORS = {
-    **dict.fromkeys(LENGTHS, MILLIMETRES),
-    "mass": 1e-3,
-    "young_modulus": 1e6,
-    "area": 1e-6,
-}  # from the units of options to SI
+FACTORS = {**dict.fromkeys(LENGTHS, MILLIMETRES), "mass": 1e-3, "young_modulus": 1e6, "area": 1e-6}
+"""From the units of options to SI."""
 
 
 class Questions:

@@ -1,8 +1,8 @@
 """Score tests of a model: a joint test of its residuals, and a test of each candidate.
 
 All p-values come from a parametric bootstrap: residuals are simulated under a right model. Noise is drawn for every
-recording, the noise model is estimated as for the data, and the base model is refitted linearly. One
-prediction is rolled out.
+recording, the noise model is estimated as for the data, and the base model is refitted linearly. One prediction
+is rolled out.
 """
 
 from __future__ import annotations

@@ -75,11 +75,11 @@ def write_model_experiment(
         return experiment, assumed
     columns = partial(data_tables, folder, list(tables["markers"]), recordings, commands, guess, kept=kept)
     runs, unread = read_back(write(columns()), folder)
-    assumed = [*assumed, *([f"the last third is the test, since a recording was not read: {unread}"] if unread else [])]
     if len(runs) == len(recordings):
         timed, counts = guess.time is not None or guess.sample_time is not None, [len(run.time) for run in runs]
         write(columns(pieces=pieces_of(counts, days_of(recordings), group_repeats(runs), timed=timed, kept=kept)))
-    return experiment, assumed
+    told = [f"the last third is the test, since a recording was not read: {unread}"] if unread else []
+    return experiment, [*assumed, *told]
 
 
 def _first_seen(guess: Guess, recordings: list[Path], commands: list[Path]) -> dict[str, Float[np.ndarray, "3"] | None]:

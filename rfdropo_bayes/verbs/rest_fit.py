@@ -351,9 +351,8 @@ def _by_way(fit: RestFit) -> list[str]:
     share = np.sum(slope**2, axis=1) * size / max(float(np.sum(residual**2)), 1e-300)
     most = int(np.argmax(share))
     times = share[most] / max(1.0 - share[most], 1e-300) * (freedom - 1)
-    chance = min(
-        1.0, ratio_of_variances.sf(times, 3, 3 * (freedom - 1)) * len(share)
-    )  # of white residuals, at any channel
+    # Of white residuals, at any channel.
+    chance = len(share) * ratio_of_variances.sf(times, 3, 3 * (freedom - 1))
     if share[most] < WAYS or chance > CHANCE:
         return []
     apart = _millimetres(2.0 * float(np.linalg.norm(slope[most])))
