@@ -88,6 +88,12 @@ def _turned_by_hand(robot: Robot) -> bool:
     return _pulled_by_section(robot) and bool(GuideAzimuth.for_robot(robot).parameters)
 
 
+def _first_section(robot: Robot) -> list[str]:
+    """The channels of the cables that end lowest."""
+    ends = [robot.cables[int(np.argmax(np.abs(column)))].guide_z_m[-1] for column in np.array(robot.channels.gain).T]
+    return [channel for channel, end in zip(robot.channel_names, ends, strict=True) if end == min(ends)]
+
+
 def _hardly_shortens(robot: Robot) -> bool:
     """Whether zeros of cables of imposed lengths would press a body, such as a metal backbone, by more than the tension
     that bends it: the cables stretch instead."""
@@ -151,7 +157,10 @@ def installed_priors(
     if _pulled_by_section(robot) or _hardly_shortens(robot):
         lines.append("cable_compliance = {}  # stretch of a cable over its tension")
     if _turned_by_hand(robot):
-        wide, words = (TURN, "which was not given") if "segment_azimuths" in assumed else (TILT, "over the drawing's")
-        normal("guide_azimuth_error", wide, f"azimuth of the cables of a channel, {words}")
+        told = "segment_azimuths" not in assumed
+        words = "over the drawing's" if told else "by a turn of their section, which was not given"
+        normal("guide_azimuth_error", TILT if told else TURN, f"azimuth of the cables of a channel, {words}")
+        for channel in [] if told else _first_section(robot):
+            normal(f"guide_azimuth_error_{channel}", TILT, "the first section turns with the measuring frame")
     lines.append("axial_stiffness = {}  # in tension, over that which the profile has for its bending")
     return lines

@@ -126,6 +126,11 @@ def test_cables_of_an_arm_with_sections_stretch_and_are_turned():
     assert {"cable_compliance", "guide_azimuth"} <= set(installed_mechanisms(robot))
     wide, narrow = (priors_of(installed_priors(robot, None, None, known)) for known in (["segment_azimuths"], []))
     assert wide["guide_azimuth_error"] == 5 * narrow["guide_azimuth_error"]
+    # The turn of the first section is that of the measuring frame: its cables are evenly around it.
+    assert {name for name in wide if name.startswith("guide_azimuth_error_")} == {
+        f"guide_azimuth_error_s1_pull_{k}" for k in range(1, 5)
+    }
+    assert wide["guide_azimuth_error_s1_pull_1"] == narrow["guide_azimuth_error"]
     assert "guide_azimuth" not in installed_mechanisms(several(command_unit="m", pairs=True))
     forces = several(command_unit="N")
     assert not {"cable_compliance", "guide_azimuth"} & {*installed_mechanisms(forces), *installed_mechanisms(arm())}
