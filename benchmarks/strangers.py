@@ -106,7 +106,7 @@ BY_COMMANDS = {
     "command_delay": EngineEffect(("command_delay",), 0.02, "s", command=late),
     "backlash": EngineEffect(("backlash",), 1e-3, "m", command=with_play),
 }
-IN_MUJOCO = {next(iter(effect.right)): effect for effect in ENGINE_EFFECTS.values()} | BY_COMMANDS
+IN_MUJOCO = {effect.right[0]: effect for effect in ENGINE_EFFECTS.values()} | BY_COMMANDS
 EFFECTS_IN_MUJOCO = (
     NOTHING,
     "command_delay",

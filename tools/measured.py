@@ -157,7 +157,7 @@ def page() -> str:
         days=days(),
         asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
-        motion=audits("audit_power/level/datasets.jsonl"),
+        motion=audits("audit_power/level/datasets.jsonl", "audit_power/pose/datasets.jsonl"),
         removed=audits("audit_power/pose/datasets.jsonl")["removed_rho_0.5"],  # by the test of the pose
         laws=laws(),
         strangers={kind: strangers(kind) for kind in ("motion", "at_rest")},

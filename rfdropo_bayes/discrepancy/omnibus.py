@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from scipy.stats import norm, rankdata
 
 DIRECTED = "candidates"  # the statistic that is the largest score of any candidate
-# Share of the level that this statistic gets. Of 75 effects of rho .15 it shows 72 at its share of 2 %, the others show
-# 15 at theirs, and none besides.
+# Share of the level that this statistic gets. Of 75 effects of rho .15 it shows 72 at its share of 2 %, the others but
+# the test of the pose show 15 at theirs, and none besides.
 SHARE = 0.75
 POSE = "pose"  # the statistic of what depends on the predicted pose, see `pose_regressors`
 BLOCK = 10  # rows
