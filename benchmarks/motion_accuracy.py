@@ -29,14 +29,14 @@ from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.robots import Robot
 from studies.engine_study import CENTRE
 from studies.mujoco_truth import EngineArm, MuJoCoArm
-from studies.pyelastica_truth import ElasticaArm
+from studies.pyelastica_truth import PACE, ElasticaArm
 
 ROBOT = "smooth_arm"
 ALLOWED = (1.0, 0.1)  # mm
 OURS = ((1, 20.0), (1, 10.0), (2, 10.0), (4, 5.0), (8, 5.0))  # elements for each of the robot's own, steps [ms]
 FINEST_MS = 2.5  # [ms] of the series that has our limit
 LINKS = {5: (1e-3, 5e-4, 2.5e-4), 10: (1e-3, 5e-4, 2.5e-4), 20: (2.5e-4, 1e-4), 40: (5e-5,)}  # steps [s]
-ELEMENTS = (5, 10, 20)
+ELEMENTS = (5, 10, 20, 40)
 Path3 = Float[np.ndarray, "time 3"]
 
 
@@ -114,7 +114,7 @@ def main() -> None:
         timed(
             lambda n=count: ElasticaArm(robot, {**CENTRE, "rayleigh_mass": 10.0}, elements=n),
             recording,
-            f"PyElastica, {count} elements, 0.05 ms",
+            f"PyElastica, {count} elements, {1e3 * PACE / count:g} ms",
         )
         for count in ELEMENTS
     ]

@@ -4,6 +4,10 @@ A section keeps its shape, as if Poisson's ratio were zero, twists with half of 
 one (Cowper). A cable runs straight from guide to guide. Its pull is that of a spring in series with the commanded
 length, zero where it is slack, and acts on every guide, with its lever about the axis. The rod's own stepper is
 explicit, and so is damped in proportion to mass: damping in proportion to stiffness would need steps of 0.5 us.
+
+PyElastica's own sections keep their volume: at a stretch e their axial and shear stiffness is divided by e, their
+bending and twist stiffness by e^3 (Gazzola et al. 2018). The sections here keep their stiffness, as those of MuJoCo's
+arm and of the package do: otherwise the tips are 1 mm apart with nothing hidden (.06 mm with it).
 """
 
 from __future__ import annotations
@@ -34,8 +38,8 @@ from studies.mujoco_truth import (
     seen_at,
 )
 
-ELEMENTS = 20
-STEP = 5e-5  # [s]: with twice as much the rod diverges; half as much moves the tip by 0.001 mm (root mean square)
+ELEMENTS = 40  # of the package's arm the tip is .06 mm apart (rms of 5 s), with 20 elements .13
+PACE = 1e-3  # [s] a step times the number of elements: twice as much diverges with 20 and with 40
 
 
 class _Cables(NamedTuple):
@@ -92,12 +96,13 @@ def _pull(
     frame: np.ndarray,
     forces: np.ndarray,
     torques: np.ndarray,
+    step: float,
 ) -> None:
     """Add the pull of the cables to forces on nodes (3, node) [N] and torques on elements (3, element), in the axes of
     their sections [N m].
 
     Rows of ``frame`` are these axes, (3, 3, element). ``wanted`` are lengths of the cables without tension, ``before``
-    those that they had a step ago [m], which are renewed; the first is negative before the first step.
+    those that they had a ``step`` [s] ago [m], which are renewed; the first is negative before the first step.
     """
     guides = cables.element.shape[1]
     place, lever, force = np.empty((guides, 3)), np.empty((guides, 3)), np.empty((guides, 3))
@@ -113,7 +118,7 @@ def _pull(
         length = 0.0
         for g in range(guides - 1):
             length += float(np.linalg.norm(place[g + 1] - place[g]))
-        rate = (length - before[c]) / STEP if before[c] > 0.0 else 0.0
+        rate = (length - before[c]) / step if before[c] > 0.0 else 0.0
         before[c] = length
         tension = max(CABLE * (length - wanted[c]) + CABLE_DAMPING * rate, 0.0)
         force[:] = 0.0
@@ -185,6 +190,11 @@ class ElasticaArm(EngineArm):
 
     elements: int = ELEMENTS
 
+    @property
+    def step(self) -> float:
+        """Of time [s]."""
+        return PACE / self.elements
+
     def _recorded(self, recording: Trajectory, size: float) -> Float[np.ndarray, "time marker 3"]:
         clock, held = commanded(self.robot, recording, self.effect, size)
         path = self._path(held, size)
@@ -205,8 +215,8 @@ class ElasticaArm(EngineArm):
             nodes = rod.position_collection
             path[row] = ((1.0 - share) * nodes[:, marked] + share * nodes[:, marked + 1]).T
             wanted[:] = cables.rest - level
-            for _ in range(round(CONTROL / STEP)):
-                time = stepper.step(scene, time, np.float64(STEP))
+            for _ in range(round(CONTROL / self.step)):
+                time = stepper.step(scene, time, np.float64(self.step))
         return path
 
     def _scene(self, elastica: Any, pull: Callable[..., None], size: float) -> tuple[Any, Any]:
@@ -218,12 +228,15 @@ class ElasticaArm(EngineArm):
             def apply_forces(self, system: Any, time: float = 0.0) -> None:
                 """Add their forces and torques."""
                 where = (system.position_collection, system.director_collection)
-                pull(*where, system.external_forces, system.external_torques)
+                pull(*where, system.external_forces, system.external_torques, step)
+                system.shear_matrix[:] = shear * system.dilatation
+                system.bend_matrix[:] = bend * system.voronoi_dilatation**3
 
         class Scene(elastica.BaseSystemCollection, elastica.Constraints, elastica.Forcing, elastica.Damping):
             """What PyElastica simulates."""
 
         scene, rod = Scene(), self._rod(elastica)
+        step, shear, bend = self.step, rod.shear_matrix.copy(), rod.bend_matrix.copy()
         parts = ElasticaParts(rod.mass, np.array(self.robot.gravity_m_s2, dtype=float))
         if self.effect is not None and self.effect.model is not None:
             self.effect.model(parts, size)
@@ -233,7 +246,7 @@ class ElasticaArm(EngineArm):
         scene.add_forcing_to(rod).using(elastica.GravityForces, acc_gravity=parts.gravity)
         scene.add_forcing_to(rod).using(Pull)
         constant = self.values["rayleigh_mass"]
-        scene.dampen(rod).using(elastica.AnalyticalLinearDamper, uniform_damping_constant=constant, time_step=STEP)
+        scene.dampen(rod).using(elastica.AnalyticalLinearDamper, uniform_damping_constant=constant, time_step=step)
         scene.finalize()
         return scene, rod
 

@@ -27,7 +27,7 @@ def blank():
 
 @pytest.fixture(scope="module")
 def arm():
-    return MuJoCoArm(rb.Robot.load("smooth_arm"), CENTRE)
+    return MuJoCoArm(rb.Robot.load("smooth_arm"), CENTRE, links=20)
 
 
 def apart(arm, blank, **parameters):
@@ -64,7 +64,11 @@ def test_a_payload_hangs_where_ours_does(arm, blank):
 def test_the_file_moves_as_the_arm_that_is_recorded(arm, blank, tmp_path):
     """Effects stand in the file, whose actuators take displacements of cables."""
     robot = arm.robot.without_command_timing()
-    write_arm(tmp_path / "arm.xml", arm_xml(robot, CENTRE), {"payload at the tip": 0.01, "gain of one actuator": 0.2})
+    write_arm(
+        tmp_path / "arm.xml",
+        arm_xml(robot, CENTRE, arm.links),
+        {"payload at the tip": 0.01, "gain of one actuator": 0.2},
+    )
     names = {name: f"site/{name}" for name in robot.marker_names}
     channels = {name: name for name in robot.channel_names}
     file = rb.MuJoCo(tmp_path / "arm.xml", markers=names, channels=channels, start="rest", command_unit="m")
