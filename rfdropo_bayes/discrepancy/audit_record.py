@@ -23,13 +23,12 @@ from rfdropo_bayes.discrepancy.score import likeness
 from rfdropo_bayes.discrepancy.score_tests import ScoreRow, ScoreTests
 from rfdropo_bayes.discrepancy.sentence import sentence
 from rfdropo_bayes.discrepancy.verdict import NEGLIGIBLE, NO_DISCREPANCY, NO_VERDICT, UNEXPLAINED
+from rfdropo_bayes.posteriors import sharper_less_median
 
 SCHEMA_VERSION = 1
 MILLIMETRES = 1e3
 STIFFNESS = "young_modulus"
 FORCES = frozenset({"N", "kg", "Pa", "J", "W"})  # units that hold one force each
-FAMILY = 3  # fewest members that have a median beside them
-SHARPER = 0.5  # deviation of differences over that of members: .88 and more if independent, .06 beside a common gain
 MORE_TESTS = 6  # recordings: all must favour a model by chance in one case of 64 only
 REFINE = "raise [simulator] refine and, if the robot moves, shorten time_step"
 SHORTEN = "shorten [simulator] time_step"  # of a mesh, whose finer simulation has the same elements
@@ -336,16 +335,10 @@ def relative_sizes(coordinates: Coordinates, fit: Fit, indices: Sequence[int]) -
 
 
 def differences(coordinates: Coordinates, draws: Float[np.ndarray, "draw d"], indices: Sequence[int]) -> dict[str, Any]:
-    """Members of a family less their median, if the data determine these differences much better than the members.
-
-    A base parameter may act as all members together: a gain of all drives beside gains of single cables.
-    """
+    """Members of a family less their median, if the data determine these differences much better than the members."""
     parameters = [coordinates.space.parameters[i] for i in indices]
-    if len(indices) < FAMILY or len({each.spec.unit for each in parameters}) > 1:
-        return {}
-    values = coordinates.values(draws)[:, list(indices)]
-    apart = values - np.median(values, axis=1, keepdims=True)
-    if np.mean(apart.var(axis=0)) > SHARPER**2 * np.mean(values.var(axis=0)):
+    apart = sharper_less_median(coordinates.values(draws)[:, list(indices)])
+    if apart is None or len({each.spec.unit for each in parameters}) > 1:
         return {}
     return {
         f"{coordinates.names[i]}_less_median": {

@@ -14,7 +14,7 @@ import xarray as xr
 from jaxtyping import Bool, Float
 
 from rfdropo_bayes.errors import InputError
-from rfdropo_bayes.posteriors.derived import ProductOfPowers, evaluate_products
+from rfdropo_bayes.posteriors.derived import Derived, LessMedian, ProductOfPowers, evaluate_derived
 from rfdropo_bayes.posteriors.inference_data import (
     InferenceData,
     in_arviz,
@@ -75,7 +75,7 @@ class PosteriorRecord:
     # prior draws, physical units; may be empty
     prior: Mapping[str, Float[np.ndarray, " draw"]] = field(default_factory=dict)
     recordings: tuple[RecordingPrediction, ...] = ()  # predictions; may be empty
-    derived: tuple[ProductOfPowers, ...] = ()  # definitions of the variables that are functions of others
+    derived: tuple[Derived, ...] = ()  # definitions of the variables that are functions of others
     trace: Sequence[Mapping[str, float]] = ()  # numbers of the sampler, one dictionary per stage
     # per block ``first_row``, ``last_row`` (1-based, inclusive), ``log_score`` = log p(block | rows before it), ``sd``
     block_scores: Sequence[Mapping[str, float]] = ()
@@ -102,22 +102,24 @@ class PosteriorRecord:
         """Draws of one variable, chains joined."""
         return np.asarray(self.posterior[name]).reshape(-1)
 
-    def with_derived(self, products: Sequence[ProductOfPowers]) -> PosteriorRecord:
+    def with_derived(self, quantities: Sequence[Derived]) -> PosteriorRecord:
         """The same record with quantities added that are functions of its parameters, in posterior and prior.
 
         Raises:
-            InputError: see `evaluate_products`.
+            InputError: see `evaluate_derived`.
         """
-        infos = tuple(
-            ParameterInfo(p.parameter, p.unit, 0.0, np.inf, {}, p.description, Scope(p.owner)) for p in products
-        )
-        prior = {**self.prior, **evaluate_products(self.prior, products)} if self.prior else {}
+        lows = [0.0 if isinstance(q, ProductOfPowers) else -np.inf for q in quantities]
+        infos = [
+            ParameterInfo(q.parameter, q.unit, low, np.inf, {}, q.description, Scope(q.owner))
+            for q, low in zip(quantities, lows, strict=True)
+        ]
+        prior = {**self.prior, **evaluate_derived(self.prior, quantities)} if self.prior else {}
         return PosteriorRecord(
-            self.parameters + infos,
-            {**self.posterior, **evaluate_products(self.posterior, products)},
+            (*self.parameters, *infos),
+            {**self.posterior, **evaluate_derived(self.posterior, quantities)},
             prior,
             self.recordings,
-            self.derived + tuple(products),
+            (*self.derived, *quantities),
             self.trace,
             self.block_scores,
             self.log_likelihood,
@@ -130,7 +132,7 @@ class PosteriorRecord:
 
     def tree(self) -> xr.DataTree:
         """The record as a tree of datasets, one for each of ArviZ's groups."""
-        products = [{**asdict(p), "powers": dict(p.powers)} for p in self.derived]
+        derived = [asdict(quantity) for quantity in self.derived]
         masks = {  # ArviZ expects a prediction of all observed data
             f"mask_{i}": ((f"time_{i}", f"marker_{i}"), np.asarray(r.mask, dtype=np.int8))
             for i, r in enumerate(self.recordings)
@@ -145,7 +147,7 @@ class PosteriorRecord:
             sample_stats=_stages(self.trace, self.block_scores),
             log_likelihood=self.log_likelihood,
             parameters=self.parameters,
-            attrs={"attributes": dict(self.attrs), "derived": products, "names": list(self.posterior)},
+            attrs={"attributes": dict(self.attrs), "derived": derived, "names": list(self.posterior)},
         )
 
     def save(self, path: Path) -> None:
@@ -172,6 +174,12 @@ class PosteriorRecord:
             ) from None
 
 
+def _derived(stored: Mapping[str, Any]) -> Derived:
+    if "powers" in stored:
+        return ProductOfPowers(**stored)
+    return LessMedian(**{**stored, "family": tuple(stored["family"])})
+
+
 def _from_groups(tree: xr.DataTree) -> PosteriorRecord:
     data = {name: child.to_dataset() for name, child in tree.children.items()}
     names = json.loads(tree.attrs["names"])
@@ -192,7 +200,7 @@ def _from_groups(tree: xr.DataTree) -> PosteriorRecord:
         {name: v.values for name, v in zip(names, variables, strict=True)},
         {name: prior[variable_key(name)].values[0] for name in names if variable_key(name) in prior},
         _recordings(data) if "observed_data" in data else (),
-        tuple(ProductOfPowers(**product) for product in json.loads(tree.attrs["derived"])),
+        tuple(_derived(quantity) for quantity in json.loads(tree.attrs["derived"])),
         _rows(stats, "stage"),
         _rows(stats, "block"),
         data["log_likelihood"]["row"].values if "log_likelihood" in data else None,

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 from scipy.ndimage import gaussian_filter
 
-from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord
+from rfdropo_bayes.posteriors import ParameterInfo, PosteriorRecord, ProductOfPowers
 from rfdropo_bayes.report import style
 from rfdropo_bayes.report.units import display_unit
 
@@ -215,7 +215,7 @@ def prior_posterior_figure(record: PosteriorRecord, names: Sequence[str]) -> Fig
     figure = Figure(figsize=(min(style.WIDTH, 3.2 * columns), 0.35 + 1.95 * rows))
     grid = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     infos = {info.name: info for info in record.parameters}
-    logarithmic = {p.name for p in record.derived}
+    logarithmic = {q.name for q in record.derived if isinstance(q, ProductOfPowers)}
     for axes, name in zip(grid, names, strict=False):
         draw_before_and_after(axes, infos[name], record.flat(name), record.prior.get(name), log=name in logarithmic)
     for axes in grid[len(names) :]:

@@ -48,7 +48,7 @@ class ParameterRow:
     # prior_q05, prior_q95: quantiles of the prior draws, None without them
     prior_q05: float | None
     prior_q95: float | None
-    # posterior over prior standard deviation, of the logarithm if the prior is logarithmic and for derived products
+    # posterior over prior standard deviation, of the logarithm if the prior is logarithmic and for products
     contraction: float | None
     # ess_bulk, ess_tail, mcse_mean, r_hat: ArviZ's diagnostics; ``r_hat`` is NaN for a single chain
     ess_bulk: float

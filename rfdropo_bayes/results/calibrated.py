@@ -19,7 +19,7 @@ from rfdropo_bayes.cautions import Caution, read_cautions
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.files import write_text
 from rfdropo_bayes.model.model import Model
-from rfdropo_bayes.posteriors import PosteriorRecord, RecordingPrediction
+from rfdropo_bayes.posteriors import PosteriorRecord, ProductOfPowers, RecordingPrediction
 from rfdropo_bayes.report import render_page, write_run
 from rfdropo_bayes.report.posterior_figures import draw_before_and_after, draw_pairs, pair_figure, paired_names
 from rfdropo_bayes.report.run_files import POSTERIOR
@@ -130,8 +130,8 @@ class Calibration:
         (name,) = self._known([name])
         info = next(info for info in self.record.parameters if info.name == name)
         axes = axes_or_new(ax)
-        derived = name in {product.name for product in self.record.derived}
-        draw_before_and_after(axes, info, self.record.flat(name), self.record.prior.get(name), log=derived)
+        logarithmic = name in {q.name for q in self.record.derived if isinstance(q, ProductOfPowers)}
+        draw_before_and_after(axes, info, self.record.flat(name), self.record.prior.get(name), log=logarithmic)
         handles, labels = axes.get_legend_handles_labels()
         axes.legend(dict(zip(labels, handles, strict=True)).values(), dict.fromkeys(labels))
         return axes

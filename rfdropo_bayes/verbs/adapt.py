@@ -57,7 +57,7 @@ from rfdropo_bayes.report.scores import MeasuredPath
 from rfdropo_bayes.results.calibrated import Calibration
 from rfdropo_bayes.tables import changed
 from rfdropo_bayes.verbs.arguments import given_fit
-from rfdropo_bayes.verbs.calibrate import gather_facts, with_ratios
+from rfdropo_bayes.verbs.calibrate import families_of, gather_facts, with_determined
 from rfdropo_bayes.verbs.left_out_sessions import OPENINGS
 from rfdropo_bayes.verbs.predict import fitted_scopes, model_of
 from rfdropo_bayes.verbs.recording_doubts import cautions_after, with_doubts
@@ -482,7 +482,7 @@ def _record(
     predictions = with_repeats_marked(adapted.predictions, [asked.head, *asked.tested])
     record = PosteriorRecord(infos, draws, {**prior, **drawn}, tuple(predictions), attrs=attributes)
     doubts = cautions_after(asked.fit.record, asked.model, [asked.head, *asked.tested])
-    return with_doubts(with_ratios(record, problem.names), doubts)
+    return with_doubts(with_determined(record, problem.names, families_of(problem)), doubts)
 
 
 def _of_other_groups(asked: SessionTask, draws: int) -> tuple[list[InferredParameter], Batch]:

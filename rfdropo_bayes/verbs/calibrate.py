@@ -29,12 +29,15 @@ from rfdropo_bayes.model.model import Model
 from rfdropo_bayes.model.run_folder import CHECKPOINTS, CONFIG, LOG, hashes, run_folder
 from rfdropo_bayes.posteriors import (
     FIXED,
+    Derived,
     DrawsByOwner,
+    LessMedian,
     PosteriorRecord,
     ProductOfPowers,
     RecordingPrediction,
     by_owner,
     central_interval,
+    sharper_less_median,
 )
 from rfdropo_bayes.prediction.model_error import MODEL_ERROR, ModelError, model_error
 from rfdropo_bayes.prediction.predictive import (
@@ -311,7 +314,7 @@ def record_posterior(
             **known_noise(problem),
         },
     )
-    return with_ratios(record, scopes.names), cautions
+    return with_determined(record, scopes.names, families_of(problem)), cautions
 
 
 def _unseen_sessions(
@@ -359,11 +362,20 @@ def check_fit(problem: CalibrationProblem, record: PosteriorRecord, counted: boo
     return check_residuals(list(white), problem.model.recordings.markers, counted=counted)
 
 
-def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecord:
-    """The record with ratios of stiffnesses and masses. Length-driven cables determine these ratios, but not the common
-    scale of stiffnesses and masses.
+def families_of(problem: CalibrationProblem) -> list[list[str]]:
+    """Names of the parameters of each mechanism in the model."""
+    mechanisms = getattr(problem.model.simulator, "mechanisms", ())
+    return [[spec.name for spec in mechanism.parameters] for mechanism in mechanisms]
 
-    Stiffness over mass, and each payload over both; a payload that is zero in some draw is skipped.
+
+def with_determined(
+    record: PosteriorRecord, names: Sequence[str], families: Sequence[Sequence[str]] = ()
+) -> PosteriorRecord:
+    """The record with the combinations of parameters that motion determines, if not the parameters themselves.
+
+    Length-driven cables determine ratios of stiffnesses and masses, but not their common scale: stiffness over mass,
+    and each payload over both; a payload that is zero in some draw is skipped. Members of a family (gains of single
+    cables) may be determined less their median, see `sharper_less_median`.
     """
     scales = [(name, unit) for name, unit in (("young_modulus", "kg/Pa"), ("trunk_mass", "-")) if name in names]
     ratios = []
@@ -377,7 +389,16 @@ def with_ratios(record: PosteriorRecord, names: Sequence[str]) -> PosteriorRecor
             words = f"payload over {name.replace('_', ' ')}: determined by motion, independent of the common scale"
             ratios.append(ProductOfPowers(f"{PAYLOAD}_over_{name}", unit, powers, words, payload.scope.owner))
     drawn = [draws for draws in (record.posterior, record.prior) if draws]
-    return record.with_derived([p for p in ratios if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)])
+    found: list[Derived] = [p for p in ratios if all(np.all(draws[n] > 0.0) for draws in drawn for n in p.powers)]
+    units = {info.name: info.unit for info in record.free}
+    for family in families:
+        own = tuple(name for name in family if name in units)
+        if len({units[name] for name in own}) != 1:
+            continue
+        if sharper_less_median(np.stack([record.flat(name) for name in own], axis=1)) is not None:
+            words = "beside the others of its family: determined, if all of them together are not"
+            found += [LessMedian(f"{name}_less_median", units[name], name, own, words) for name in own]
+    return record.with_derived(found)
 
 
 def gather_facts(

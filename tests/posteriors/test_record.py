@@ -12,6 +12,7 @@ import xarray as xr
 
 from rfdropo_bayes.errors import InputError
 from rfdropo_bayes.posteriors import (
+    LessMedian,
     ParameterInfo,
     PosteriorRecord,
     ProductOfPowers,
@@ -20,6 +21,8 @@ from rfdropo_bayes.posteriors import (
     load_posterior,
     summarise,
 )
+
+BESIDE = LessMedian("density_less_median", "kg/m3", "density", ("young_modulus", "density", "offset_x@day/1"))
 
 
 def make_record(rng: np.random.Generator) -> PosteriorRecord:
@@ -59,7 +62,7 @@ def make_record(rng: np.random.Generator) -> PosteriorRecord:
         block_scores=[{"first_row": 1, "last_row": 3, "log_score": 4.0, "sd": float("nan")}],
         log_likelihood=rng.normal(size=(2, 60, 7)),
         attrs={"data_sha256": "ab", "seed": 3, "versions": {"numpy": "2"}},
-    ).with_derived([ProductOfPowers("specific_stiffness", "m2/s2", {"young_modulus": 1, "density": -1})])
+    ).with_derived([ProductOfPowers("specific_stiffness", "m2/s2", {"young_modulus": 1, "density": -1}), BESIDE])
 
 
 @pytest.fixture
@@ -119,6 +122,7 @@ def test_arviz_plots_predictions(record: PosteriorRecord, tmp_path: Path) -> Non
 def test_derived_quantities_follow_their_draws(record: PosteriorRecord) -> None:
     ratio = record.posterior["young_modulus"] / record.posterior["density"]
     np.testing.assert_allclose(record.posterior["specific_stiffness"], ratio, rtol=1e-12)
+    assert not record.posterior[BESIDE.name].any(), "density lies between the two others"
     assert [info.name for info in record.free] == ["young_modulus", "density", "offset_x@day/1"]
     with pytest.raises(InputError, match="unknown parameter 'mass'"):
         record.with_derived([ProductOfPowers("x", "-", {"mass": 1})])
