@@ -30,7 +30,7 @@ POISSON = 0.0  # of the arm: its sections are rigid, and twist with E / 2
 SHEARED = 6.0 * (1.0 + POISSON) / (7.0 + 6.0 * POISSON)  # share of a solid round section that shears (Cowper 1966)
 CONTROL = 1e-3  # [s] for which a command is held
 CABLE = 5e4  # [N/m] of a servo
-CABLE_DAMPING = 5.0  # [N s/m]
+CABLE_DAMPING = 0.5  # [N s/m]: a damper is an effect that ours lacks; 5 moves a tip of PyElastica by .23 mm, .5 by .02
 STILL = 1e-6  # m that a marker moves in a twentieth of a second, below which an arm rests
 LONGEST = 60.0  # [s] that an arm may take to come to rest
 

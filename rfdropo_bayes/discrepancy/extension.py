@@ -153,9 +153,8 @@ class ExtensionSearch:
     def score_tests(self, fit: Fit, without: Sequence[str] = ()) -> ScoreTests:
         """Test a fit and its missing candidates.
 
-        An error of mesh or time step that is too small to be named is not counted as a discrepancy: the residuals of
-        the finer simulator are used if they pass more easily. An error is too small if the score test does not see it,
-        or if it moves the markers by less than the noise, see `_below_the_noise`.
+        An error of mesh or time step that the score test does not see is not counted as a discrepancy: the residuals of
+        the finer simulator are used if they pass more easily. See also `corrected`.
         """
         # Some members of a family of parameters may be in the model already.
         missing = [replace(c, indices=tuple(i for i in c.indices if i not in fit.free)) for c in self.candidates]
@@ -187,32 +186,34 @@ class ExtensionSearch:
                 return replace(tests, omnibus=self._tested(fit, len(without)), finer=None)
             if tests.finer is None:
                 return tests
-            seen = tests.row(DISCRETISATION).adjusted_p <= self.rules.level
-            if seen and self._below_the_noise(fit):
-                # The simulation without its error in space and time, estimated from two resolutions. The change by
-                # halving the steps is a part of the error: half at first order of the time steps, three quarters at
-                # second order of the mesh. The error is therefore one to two times the change, as the data have it.
-                base, halved = span(fit.jacobian), probes[-1].columns
-                moved, left = project_out(base, halved)[:, 0], project_out(base, fit.residual[:, None])[:, 0]
-                times = np.clip(float(moved @ left) / max(float(moved @ moved), 1e-300), 1.0, 2.0)
-                exact = fit.residual - times * halved[:, 0]
-                again = run_score_tests(
-                    self.target, fit, probes, names, [self.seed, len(without)], self.rules.bootstraps, exact
-                )
-                tests, seen = replace(tests, finer=again.finer), False
-        if not seen and tests.finer is not None:
-            tests = replace(tests, omnibus=max(tests.omnibus, tests.finer, key=lambda test: test.p))
-        return tests
+            if tests.row(DISCRETISATION).adjusted_p > self.rules.level:
+                tests = replace(tests, omnibus=max(tests.omnibus, tests.finer, key=lambda test: test.p))
+            return tests
 
-    def _below_the_noise(self, fit: Fit) -> bool:
-        """Whether a finer mesh and time step move the markers by no more than the noise of one measurement.
+    def corrected(self, tests: ScoreTests) -> Forward | None:
+        """The simulator with its error in space and time corrected; None unless the score tests of a model show this
+        error and it moves the markers by less than the noise of one measurement.
 
-        Many rows and repeats make any such shift significant, and no data set with this noise is worth a finer mesh.
+        Many rows and repeats make any error significant, no data set with such a noise is worth a finer mesh, and
+        candidates would imitate the error. It is estimated from two resolutions. The change by halving the steps is a
+        part of it: half at first order of the time steps, three quarters at second order of the mesh. The error is
+        therefore one to two times the change, as the data have it (Richardson's extrapolation).
         """
-        if self.finer is None:
-            return False
-        shift = numerical_shift(self.target, self.finer, fit)
-        return shift is not None and shift <= noise_distance(self.target.measured.noise.first)
+        target, fit, finer = self.target, tests.fit, self.finer
+        if finer is None or tests.finer is None or target.known is not None or target.forward.correction:
+            return None
+        row = tests.row(DISCRETISATION)
+        if row.adjusted_p > self.rules.level or row.probe is None:
+            return None
+        shift = numerical_shift(target, finer, fit)
+        if shift is None or shift > noise_distance(target.measured.noise.first):
+            return None
+        base = span(fit.jacobian)
+        moved, left = (project_out(base, each)[:, 0] for each in (row.probe.columns, fit.residual[:, None]))
+        times = np.clip(float(moved @ left) / max(float(moved @ moved), 1e-300), 1.0, 2.0)
+        coarse, fine = target.forward.observe_one(fit.x), finer.observe_one(fit.x)
+        fields = target.forward.lanes.fields
+        return target.forward.with_correction({name: times * (fine[name] - coarse[name]) for name in fields})
 
     def tested(self, fit: Fit, number: int) -> ScoreTests:
         """The joint test of a model, without tests of candidates."""
@@ -229,8 +230,6 @@ class ExtensionSearch:
         """The leading classes, one candidate refitted after the other; then the best of them from afar, see
         `_from_distant_starts`."""
         significant = [row for row in tests.rows if row.adjusted_p <= self.rules.level and row.probe is not None]
-        if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(tests.fit):
-            significant = [row for row in significant if row.name != DISCRETISATION]
         leads = {row.name: self._lead(tests.fit, row) for row in significant}
         drops = {name: drop for name, (drop, _) in leads.items()}
         leading = self._leading(significant, drops)
@@ -400,12 +399,12 @@ class ExtensionSearch:
 
 
 def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None:
-    """Root mean square distance [m] by which a finer mesh and time step move the measured markers; None after a failed
-    finer rollout.
+    """Root mean square distance [m] by which a finer mesh and time step move the measured markers, which no correction
+    changes; None after a failed finer rollout.
     """
     seen, fine = finer.observe(fit.x[None])
     if not fine[0]:
         return None
-    moved = target.forward.observe_one(fit.x)["position"] - seen["position"][0]
+    moved = target.forward.with_correction({}).observe_one(fit.x)["position"] - seen["position"][0]
     measured = target.measurements.channels[0].valid
     return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))

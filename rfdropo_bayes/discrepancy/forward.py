@@ -63,6 +63,7 @@ class Forward:
         self.rollouts = 0
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
         self.compiling = 0.0  # seconds that rollouts took to compile
+        self.correction: Fields = {}  # added to the observations of the recordings, as the simulator's numerical error
         self.forget()
 
     def forget(self) -> None:
@@ -87,11 +88,20 @@ class Forward:
             self.lanes.fields,
             *prior,
             *map(np.asarray, self.commands[:4]),
+            *self.correction.values(),
         )
 
     def with_difference(self, step: float) -> Forward:
         """The forward model with another step of derivatives."""
         return self._with(lanes=self.lanes.with_difference(step))
+
+    def with_correction(self, correction: Fields) -> Forward:
+        """The forward model with something added to some fields of every recording's observations."""
+        return self._with(correction=dict(correction))
+
+    def corrected(self, shown: Fields) -> Fields:
+        """Observations (point, recording, ...) of the simulator with the correction."""
+        return {name: part + self.correction[name] if name in self.correction else part for name, part in shown.items()}
 
     def with_coordinates(self, coordinates: Coordinates) -> Forward:
         """The forward model in other coordinates of the same parameters."""
@@ -135,7 +145,7 @@ class Forward:
         for name in self.lanes.fields:
             fine &= np.isfinite(fields[name][:, :rows]).reshape(len(fine), -1).all(axis=1)
         shown = {name: part.reshape(len(points), self.count, *part.shape[1:]) for name, part in fields.items()}
-        shown |= {"offset": self._offset(theta), **self.coordinates.gains(points)}
+        shown = self.corrected(shown) | {"offset": self._offset(theta), **self.coordinates.gains(points)}
         fine = fine.reshape(len(points), -1).all(axis=1)
         if rows is None and len(points) <= KEPT:
             self._recent = {point.tobytes(): i for i, point in enumerate(points)}, shown, fine

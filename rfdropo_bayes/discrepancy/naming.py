@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits
-from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, polled
+from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise, polled
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.repairs import optimised_again, paying_pair, simplified
 from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
@@ -98,7 +98,8 @@ class Named:
 def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
     """Forward-stepwise extension of a base model; the last result has the score tests of the final model.
 
-    The base model is replaced if a candidate has led to a better optimum of it.
+    The base model is replaced if a candidate has led to a better optimum of it, and the simulator if the data show its
+    numerical error, see `ExtensionSearch.corrected`.
     """
     clock, report, rules = search.target.forward.deadline, search.report, search.rules
     named, renewed = Named(search, base), set[int]()  # numbers of steps at which a model was optimised again: once each
@@ -116,6 +117,12 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
         yield named
         p = tests.omnibus.p
         if not named.steps and p > rules.level:
+            return
+        exact = named.asked.corrected(tests)
+        if exact is not None:
+            report(f"joint test p {p_in_words(p, rules.bootstraps)}; once more without the error of mesh and time step")
+            target = search.target.on(exact)
+            yield from name_causes(search.under(target), optimise(target, named.base.x, named.base.free))
             return
         first = tests.rows[0].name if tests.rows else "none"
         report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")

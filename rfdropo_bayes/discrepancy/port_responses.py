@@ -167,6 +167,7 @@ def _response(
             parts, _ = forward.lanes.roll(theta[lane], forward.start[lane], commands, forward.deadline.check)
             forward.rollouts += len(lane)
         named = {name: part.reshape(count, forward.count, *part.shape[1:]) for name, part in parts.items()}
+        named = named if port.stage == "sensing" else forward.corrected(named)
         before, moved = target.shown_errors(shown), target.shown_errors({**shown, **named}, tuple(named))
         white = target.measurements.whiten(np.nan_to_num(before - moved) / step, target.noise)
         series = target.measurements.series(white).reshape(count, forward.count, -1)
