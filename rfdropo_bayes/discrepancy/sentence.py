@@ -264,7 +264,7 @@ def _invisible(answer: Answer) -> str:
     names = [
         row.name.replace("_", " ")
         for row in answer.test_series[0].rows
-        if row.probe is None and not answer.problem.group_of(row.name)
+        if row.probe is None and row.name != DISCRETISATION and not answer.problem.group_of(row.name)
     ]
     if not names:
         return ""
