@@ -192,7 +192,7 @@ class ExtensionSearch:
 
     def corrected(self, tests: ScoreTests) -> Forward | None:
         """The simulator with its error in space and time corrected; None unless the score tests of a model show this
-        error and it moves the markers by less than the noise of one measurement.
+        error before any candidate, and it moves the markers by less than the noise of one measurement.
 
         Many rows and repeats make any error significant, no data set with such a noise is worth a finer mesh, and
         candidates would imitate the error. It is estimated from two resolutions. The change by halving the steps is a
@@ -202,11 +202,10 @@ class ExtensionSearch:
         target, fit, finer = self.target, tests.fit, self.finer
         if finer is None or tests.finer is None or target.known is not None or target.forward.correction:
             return None
-        row = tests.row(DISCRETISATION)
-        if row.adjusted_p > self.rules.level or row.probe is None:
+        row = tests.rows[0]
+        if row.name != DISCRETISATION or row.adjusted_p > self.rules.level or row.probe is None:
             return None
-        shift = numerical_shift(target, finer, fit)
-        if shift is None or shift > noise_distance(target.measured.noise.first):
+        if not self._below_the_noise(fit):
             return None
         base = span(fit.jacobian)
         moved, left = (project_out(base, each)[:, 0] for each in (row.probe.columns, fit.residual[:, None]))
@@ -214,6 +213,11 @@ class ExtensionSearch:
         coarse, fine = target.forward.observe_one(fit.x), finer.observe_one(fit.x)
         fields = target.forward.lanes.fields
         return target.forward.with_correction({name: times * (fine[name] - coarse[name]) for name in fields})
+
+    def _below_the_noise(self, fit: Fit) -> bool:
+        """Whether a finer mesh and time step move the markers by no more than the noise of one measurement."""
+        shift = None if self.finer is None else numerical_shift(self.target, self.finer, fit)
+        return shift is not None and shift <= noise_distance(self.target.measured.noise.first)
 
     def tested(self, fit: Fit, number: int) -> ScoreTests:
         """The joint test of a model, without tests of candidates."""
@@ -230,6 +234,8 @@ class ExtensionSearch:
         """The leading classes, one candidate refitted after the other; then the best of them from afar, see
         `_from_distant_starts`."""
         significant = [row for row in tests.rows if row.adjusted_p <= self.rules.level and row.probe is not None]
+        if any(row.name == DISCRETISATION for row in significant) and self._below_the_noise(tests.fit):
+            significant = [row for row in significant if row.name != DISCRETISATION]
         leads = {row.name: self._lead(tests.fit, row) for row in significant}
         drops = {name: drop for name, (drop, _) in leads.items()}
         leading = self._leading(significant, drops)
