@@ -144,8 +144,8 @@ def _parameters(rows: Iterable[tuple[str, Mapping[str, Any], str]]) -> Table:
     from rfdropo_bayes.report.units import display_unit
 
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for title in ("parameter", "unit"):
-        table.add_column(title)
+    table.add_column("parameter", overflow="fold")
+    table.add_column("unit")
     for title in ("mean", "5 %", "95 %"):
         table.add_column(title, justify="right")
     table.add_column("")
