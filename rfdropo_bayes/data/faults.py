@@ -15,7 +15,8 @@ Five kinds, each with its pattern in the numbers:
   impact) is kept and counted among the *breaks*.
 - *renamed*: the place of a marker under the name of another (`identities`).
 
-At low sampling rates ``MAX_ACCELERATION * dt**2`` exceeds any motion: no row is masked then.
+At low sampling rates ``MAX_ACCELERATION * dt**2`` exceeds any motion. A jump is then a single row far from the two rows
+before and the two rows after, which agree, while the commands stand (`_spikes`).
 """
 
 from __future__ import annotations
@@ -70,6 +71,7 @@ def find_faults(
     time: Float[np.ndarray, " time"],
     position: Float[np.ndarray, "time marker 3"],
     *,
+    command: Float[np.ndarray, "time channel"] | None = None,
     where: str = "recording",
     names: Sequence[str] = (),
 ) -> Faults:
@@ -78,6 +80,7 @@ def find_faults(
     Args:
         time: times of the rows [s].
         position: marker positions [m]; NaN if a marker was lost.
+        command: commands of the rows, if known.
         where: name of the recording in errors.
         names: marker names for the notes; numbers by default.
 
@@ -94,6 +97,8 @@ def find_faults(
     for marker in range(position.shape[1]):
         rows = np.flatnonzero(~(missing | held)[:, marker])
         wrong, level_changes = _off_path(clock[rows], position[rows, marker])
+        if command is not None:
+            wrong |= _spikes(position[rows, marker], command[rows])
         jumping[rows[wrong], marker] = True
         # a repeat of a wrong pose is as wrong as the pose; it is counted as held
         breaks.append(level_changes)
@@ -242,6 +247,24 @@ def _off_path(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, int]:
         wrong[part], broken = _longest_path(motion.part(part), reach)
         breaks += broken
     return wrong, breaks
+
+
+def _spikes(
+    position: Float[np.ndarray, "row 3"], command: Float[np.ndarray, "row channel"]
+) -> Bool[np.ndarray, " row"]:
+    """Rows of one marker that differ from both neighbours, while the two rows before and after agree and the commands
+    change no more than they usually do.
+    """
+    wrong = np.zeros(len(position), dtype=bool)
+    if len(position) < 5:
+        return wrong
+    step, sent = np.linalg.norm(np.diff(position, axis=0), axis=1), np.abs(np.diff(command, axis=0))
+    allowed = max(TOLERANCE, UNUSUAL * float(np.median(step)))
+    rough, quiet = step > allowed, (sent <= UNUSUAL * np.median(sent, axis=0)).all(axis=1)
+    across = np.linalg.norm(position[3:-1] - position[1:-3], axis=1) <= allowed
+    alone = ~rough[:-3] & rough[1:-2] & rough[2:-1] & ~rough[3:] & across
+    wrong[2:-2] = alone & quiet[:-3] & quiet[1:-2] & quiet[2:-1]
+    return wrong
 
 
 def _around(rows: np.ndarray, margin: int, length: int) -> list[slice]:

@@ -81,7 +81,8 @@ def from_arrays(
     if len(sent) != len(stamps) or not len(sent):
         wanted = f"({len(stamps)} times, {len(channels)} channels)"
         raise InputError(f"commands have the shape {sent.shape}, and not {wanted}", where=name)
-    faults = find_faults(clock, place, where=name, names=markers)
+    of_rows = sent if len(sent) == len(clock) and command_time is None else None
+    faults = find_faults(clock, place, command=of_rows, where=name, names=markers)
     notes = [
         *faults.notes,
         *rounded_notes(begins, clock),

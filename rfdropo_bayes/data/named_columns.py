@@ -340,8 +340,9 @@ def read_tables(
     source, held = _held(source, columns.commands)
     position, time = points(table, columns, mask_missing=mask_missing), _times(table, columns)
     markers = marker_names(columns)
-    faults = find_faults(time, position, where=str(table.path), names=markers)
     command = _commands(table, source, columns)
+    of_rows = command if len(command) == len(time) and columns.command_time is None else None
+    faults = find_faults(time, position, command=of_rows, where=str(table.path), names=markers)
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
     angle = _angles(table, columns)
     commands = SentCommands(sent, command, *_channels(columns), command[0], _largest(columns))
