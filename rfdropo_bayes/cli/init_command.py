@@ -233,7 +233,7 @@ def init(
     guess = None
     if files:
         columns = ask.names(files[0], names, None if cables is None else cables * (segments or 1), markers)
-        guess = guess_columns(files[0], sent[0] if sent else None, columns, _listed(command_names))
+        guess = guess_columns(files[0], sent[0] if sent else None, columns, _listed(command_names), command_unit)
         guess = with_given(guess, command_unit=command_unit, position_unit=position_unit, sample_time=sample_time)
         guess = with_turns(with_counts(guess, ask.counts(guess, counts_per_turn), command_unit is not None))
     if folder.suffix in MODELS:

@@ -260,9 +260,9 @@ def _spikes(
         return wrong
     step, sent = np.linalg.norm(np.diff(position, axis=0), axis=1), np.abs(np.diff(command, axis=0))
     allowed = max(TOLERANCE, UNUSUAL * float(np.median(step)))
-    rough, quiet = step > allowed, (sent <= UNUSUAL * np.median(sent, axis=0)).all(axis=1)
-    across = np.linalg.norm(position[3:-1] - position[1:-3], axis=1) <= allowed
-    alone = ~rough[:-3] & rough[1:-2] & rough[2:-1] & ~rough[3:] & across
+    rough, quiet = step > allowed, np.all(sent <= UNUSUAL * np.median(sent, axis=0), axis=1)
+    back = np.linalg.norm(position[3:-1] - position[1:-3], axis=1) <= allowed
+    alone = ~rough[:-3] & rough[1:-2] & rough[2:-1] & ~rough[3:] & back
     wrong[2:-2] = alone & quiet[:-3] & quiet[1:-2] & quiet[2:-1]
     return wrong
 

@@ -203,8 +203,13 @@ class CommandGain(MemorylessActuation):
     name = "command_gain"
     stage = "actuation"
     inside_drive = True
-    cause = "wrong spool radius or transmission ratio, cable stretch proportional to travel, or wrong area of chambers"
-    remedy = "measure the cable travel of one motor turn, or the pressure in the chambers"
+    cause = (
+        "wrong spool radius or transmission ratio, cable stretch proportional to travel, wrong area of chambers, or "
+        "load cells of wrong gain"
+    )
+    remedy = (
+        "measure the cable travel of one motor turn, the pressure in the chambers, or hang weights on the load cells"
+    )
     parameters = (
         ParameterSpec(
             "command_gain_error", "-", -0.9, 2.0, 0.0, normal(0.2), "relative error of the commanded displacement"
@@ -222,8 +227,14 @@ class CableGain(PerChannel, MemorylessActuation):
     name = "cable_gain"
     stage = "actuation"
     inside_drive = False
-    cause = "spools of different radius, cables that stretch, slip or are torn, or chambers that leak or differ in area"
-    remedy = "measure how far each cable travels, or the pressure in each chamber, for the same command"
+    cause = (
+        "spools of different radius, cables that stretch, slip or are torn, chambers that leak or differ in area, or "
+        "load cells of wrong gain"
+    )
+    remedy = (
+        "measure how far each cable travels, or the pressure in each chamber, for the same command, or hang the same "
+        "weight on each load cell"
+    )
     # At -1 a cable does not pull at all.
     size = ParameterSpec("cable_gain_error", "-", -1.0, 2.0, 0.0, normal(0.2), "relative error of the displacement")
 

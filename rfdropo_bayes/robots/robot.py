@@ -79,7 +79,9 @@ class Marker(RobotTable):
     """A measured point of the body, given by its position in the undeformed body."""
 
     name: Name = Field(description="name, as in the recordings")
-    point_m: Vector = Field(description="position in the undeformed body: x, y, z")
+    point_m: Vector = Field(
+        description="position beside the undeformed body: x, y, z; a ball on a stalk moves with its section"
+    )
 
 
 class OrientedSection(RobotTable):
@@ -209,8 +211,10 @@ class Robot(RobotTable):
         points |= {f"marker {marker.name}": np.array([marker.point_m]) for marker in self.markers}
         for name, place in points.items():
             width = np.stack([np.interp(place[:, 2], station, half[:, axis]) for axis in (0, 1)], axis=1)
-            outside = (place[:, 2] < station[0] - 1e-9) | (place[:, 2] > station[-1] + 1e-9)
-            if not name.startswith("marker"):  # markers may stand on stalks
+            marker = name.startswith("marker")  # it may stand on a stalk, which moves with its section
+            beyond = 0.5 * (station[-1] - station[0]) if marker else 1e-9
+            outside = (place[:, 2] < station[0] - beyond) | (place[:, 2] > station[-1] + beyond)
+            if not marker:
                 outside |= np.any(np.abs(place[:, :2]) > width + 1e-9, axis=1)
             if np.any(outside):
                 row = int(np.argmax(outside))

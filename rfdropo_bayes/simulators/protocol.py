@@ -31,7 +31,8 @@ class Result(IntEnum):
 _REMEDIES = {
     Result.OK: "",
     Result.DIVERGED: "shorten the time step or narrow the priors of stiffness, mass and damping",
-    Result.CABLE_LIMIT: "the cables could not reach their commanded lengths: check limits and initial displacements",
+    Result.CABLE_LIMIT: "the cables could not reach their commanded lengths, or the body bears no equilibrium under "
+    "their forces: check limits and initial displacements, and state a larger young_modulus",
     Result.CONTACT_NOT_CONVERGED: "shorten the time step: the contacts of a step were not solved",
     Result.NOT_IN_EQUILIBRIUM: "the initial pose was not found, or overlaps the cube: check gravity, stiffness, "
     "initial displacements and the cube's position",

@@ -130,7 +130,11 @@ class Guess(NamedTuple):
 
 
 def guess_columns(
-    path: Path, sent: Path | None = None, names: Sequence[str] | None = None, command_names: Sequence[str] | None = None
+    path: Path,
+    sent: Path | None = None,
+    names: Sequence[str] | None = None,
+    command_names: Sequence[str] | None = None,
+    unit: str | None = None,
 ) -> Guess:
     """Guess the meaning of a recording's columns.
 
@@ -138,6 +142,7 @@ def guess_columns(
         path: a CSV, an export of Motive's, a bag, a LeRobotDataset, or a file of arrays.
         sent: a CSV with the commands, if separate.
         names: column names of a CSV without names; command_names: the same for the commands' file.
+        unit: unit of the commands, if stated: of measured forces and angles, the forces are commands in N.
 
     Raises:
         InputError: a file that cannot be read, that has names and is given others, or in which no positions or
@@ -145,7 +150,7 @@ def guess_columns(
     """
     format = recognised_format(path)
     own = format == named_columns.FORMAT or format in named_arrays.FORMATS
-    whole, unit = _measured(format, path, names)
+    whole, length = _measured(format, path, names)
     _check_names(whole, names, "--names")
     table = whole.numeric(LOOKED_AT)
     time = "header" if format == rosbag.FORMAT else _clock_of(whole)
@@ -161,7 +166,7 @@ def guess_columns(
         _check_names(sending, command_names, "--command-names")
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name not in (clock, *sending.joined.get(str(clock), ()))]
-    measured = [] if sent is not None else angles or tensions
+    measured = [] if sent is not None else (tensions or angles if unit == "N" else angles or tensions)
     commands = _commands(source, free, measured, any_name=own or sent is not None)
     if not positions:
         raise _not_found(whole, time, format, "positions (columns in x, y and z)")
@@ -171,7 +176,7 @@ def guess_columns(
     tensions = tensions if len(tensions) == len(commands) else []
     units = {
         "command_unit": command_unit(sending, source, commands),
-        "position_unit": (Unit(unit) if unit else unit_in_names(whole, names_of(positions), named_columns.METRES))
+        "position_unit": (Unit(length) if length else unit_in_names(whole, names_of(positions), named_columns.METRES))
         or length_unit(table[names_of(positions)]),
         "time_unit": Unit("s")
         if format == rosbag.FORMAT

@@ -121,8 +121,10 @@ def nominal_markers(spec: ModelSpec, recording: Trajectory, longest: float) -> F
     rollout = jax.jit(lambda given: simulator.rollout(given, commands, steps))(values)
     # Rows beyond the last step mean nothing, whatever the status of a rollout that was not taken there.
     if int(rollout.status) != Result.OK:
-        word = Result(int(rollout.status)).name.lower().replace("_", " ")
-        raise InputError(f"the simulation of {recording.name!r} ended: {word}", where="[simulator]")
+        result = Result(int(rollout.status))
+        word = result.name.lower().replace("_", " ")
+        about = f"the simulation of {recording.name!r} at nominal values ended: {word}"
+        raise InputError(about, where="[simulator]", remedy=result.remedy)
     shared = shared_markers([recording], simulator.marker_names)
     chosen = [simulator.marker_names.index(name) for name in shared]
     return np.asarray(rollout.position)[:rows, chosen]

@@ -60,7 +60,7 @@ def test_unknown_robot_lists_the_known_ones():
         ("displacement_limit_m = [-0.5, 0.07]", "displacement_limit_m = [0.01, 0.07]", "does not enclose zero"),
         ('name = "long_1"', 'name = "long_0"', "cables share a name"),
         ('unit = "m"', 'unit = "rad"', "radius_parameter"),
-        ("point_m = [0, 0, 0.184368]", "point_m = [0, 0, 0.2]", "marker p20 lies outside the body"),
+        ("point_m = [0, 0, 0.184368]", "point_m = [0, 0, 0.3]", "marker p20 lies outside the body"),
         ("[parameters.young_modulus]", "[parameters.youngs_modulus]", "youngs_modulus].*did you mean 'young_modulus'"),
         ("[parameters.young_modulus]", "[parameters.tip_mass]", r"nothing uses the table \[parameters.tip_mass\]"),
         ('each = "cable"', "", r"mend \[parameters.initial_displacement\]"),

@@ -150,6 +150,16 @@ def test_counters_that_begin_anew_are_read_on(tmp_path):
     assert line.startswith("unwrap = {enc1 = 4096}  # ASSUMED")
 
 
+@pytest.mark.parametrize("force", ["F{0} (N)", "Kraft{0} [N]", "load_cell_{0}"])
+def test_of_forces_and_angles_the_forces_are_commands_in_newtons(tmp_path, force):
+    run = {"t": 0.1 * np.arange(20), "tip_x": 1.0, "tip_y": 1.0, "tip_z": np.linspace(90, 100, 20)}
+    for k in range(1, 4):
+        run[force.format(k)], run[f"enc{k}"] = np.linspace(0, 5, 20), 40 * np.arange(20)
+    pd.DataFrame(run).to_csv(tmp_path / "run.csv", index=False)
+    assert guess_columns(tmp_path / "run.csv", unit="N").commands == [force.format(k) for k in range(1, 4)]
+    assert guess_columns(tmp_path / "run.csv", unit="rad").commands == [f"enc{k}" for k in range(1, 4)]
+
+
 @pytest.mark.parametrize(("names", "unit"), [("F_{0}", "N"), ("tension{0}", "N"), ("enc{0}_counts", "counts")])
 def test_measured_forces_and_angles_stand_for_commands_that_nobody_recorded(tmp_path, names, unit):
     run = table("t", "{marker}_{axis}", names)
