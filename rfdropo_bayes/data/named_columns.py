@@ -25,6 +25,7 @@ from rfdropo_bayes.data.command_notes import command_notes
 from rfdropo_bayes.data.counters import Column, Motion, counter_notes, read_on, turns_of
 from rfdropo_bayes.data.csv_table import CsvTable
 from rfdropo_bayes.data.faults import fill_missing, find_faults
+from rfdropo_bayes.data.held_commands import averaged_while_held
 from rfdropo_bayes.data.held_readings import hold_time
 from rfdropo_bayes.data.recorded import Measured, Origin, Recorded, SentCommands
 from rfdropo_bayes.data.sample_times import TimeUnit, repeated_rows, rounded_notes, spread_repeats
@@ -340,14 +341,15 @@ def read_tables(
     source, held = _held(source, columns.commands)
     position, time = points(table, columns, mask_missing=mask_missing), _times(table, columns)
     markers = marker_names(columns)
-    command = _commands(table, source, columns)
-    of_rows = command if len(command) == len(time) and columns.command_time is None else None
+    read, unit = _commands(table, source, columns), columns.sized(columns.command_unit)[0]
+    of_rows = read if len(read) == len(time) and columns.command_time is None else None
     faults = find_faults(time, position, command=of_rows, where=str(table.path), names=markers)
+    command, averaged = averaged_while_held(read, unit) if columns.commands_with_poses else (read, [])
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)
     angle = _angles(table, columns)
     commands = SentCommands(sent, command, *_channels(columns), command[0], _largest(columns))
     commands = commands.of_poses() if columns.commands_with_poses else commands
-    notes = [*faults.notes, *_timing_notes(table, columns, time), *held]
+    notes = [*faults.notes, *_timing_notes(table, columns, time), *held, *averaged]
     notes += [note for file in {table.path: table, source.path: source}.values() for note in file.notes]
     if columns.command_time is not None:
         notes += command_notes(commands.command_time, commands.command)
