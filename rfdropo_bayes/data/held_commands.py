@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 UNUSUAL = 5.0  # times the median change from row to row; of normal noise one change in 10^12 is so large
 FEWEST_POSES, FEWEST_ROWS = 3, 4
-MOST = 0.9  # share of the rows that poses without a drift have
+MOST = 0.5  # share of the rows that poses without a drift have, beside rows between poses
 
 
 def averaged_while_held(
