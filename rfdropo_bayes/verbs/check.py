@@ -402,7 +402,7 @@ def _say_model(report: Check, experiment: Experiment, folder: Path, fitted: list
         report.doubts += [] if doubt is None else [doubt]
     recorded = {
         "tension": any(t.tension is not None for t in fitted),
-        "motor_angle": any(t.motor_angle is not None for t in fitted),
+        "motor_angle": any(t.motor_angle is not None and t.command_unit == "rad" for t in fitted),
         "object_pose": any(t.object_pose is not None for t in fitted),
         "orientation": any(t.orientation is not None for t in fitted),
     }

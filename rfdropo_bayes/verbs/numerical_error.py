@@ -75,9 +75,10 @@ def measure_numerical_error(spec: ModelSpec, recording: Trajectory) -> Numerical
         finer = _distance(here, moved(time_step=simulator.time_step / FINER))
     if simulator.engine.is_rod:
         elements = _distance(here, moved(refine=MORE_ELEMENTS * table.refine))
-    # Rows without times have no speed.
+    # Rows without times have no speed, nor have poses that were held until they rested.
     if (
         recording.timed
+        and not (simulator.at_rest and recording.settings.get("settled_poses"))
         and simulator.engine.carries_loads
         and all(QUASI_STATIC in motions_of(m) for m in simulator.mechanisms)
     ):
