@@ -167,7 +167,7 @@ def page() -> str:
         days=days(),
         asl=asl_days(),
         rest=audits("audit_rest/seeds_1000_1012.jsonl"),
-        motion=audits("audit_power/level/datasets.jsonl", "audit_power/pose/datasets.jsonl"),
+        motion=audits(*(f"audit_power/{folder}/datasets.jsonl" for folder in ("level", "pose", "corrected"))),
         removed=audits("audit_power/pose/datasets.jsonl")["removed_rho_0.5"],  # by the test of the pose
         laws=laws(),
         strangers={kind: strangers(kind) for kind in ("motion", "at_rest")},
