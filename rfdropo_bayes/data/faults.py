@@ -45,6 +45,8 @@ _VELOCITY_ROWS = 5
 _DRIFT_PER_ROW = 0.02  # share of the tolerance by which a smooth path may drift from the predicted one per row
 _MARGIN = 2  # longest runs, on both sides of a step that is not smooth
 _BLOCK = 20_000  # rows
+HELD = 0.05  # share of a command's range below which its usual change from row to row is noise
+_STANDING = 6  # changes of the commands up to the row after a jump that are noise
 _ONSET_ROWS = 3  # over this few rows a motion may start or stop at once
 _FEW = 5.0  # quanta
 
@@ -252,18 +254,26 @@ def _off_path(time: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, int]:
 def _spikes(
     position: Float[np.ndarray, "row 3"], command: Float[np.ndarray, "row channel"]
 ) -> Bool[np.ndarray, " row"]:
-    """Rows of one marker that differ from both neighbours, while the two rows before and after agree and the commands
-    change no more than they usually do.
+    """Rows of one marker that differ from both neighbours, while the two rows before and after agree, and commands that
+    are held in most rows have not changed for some rows.
     """
     wrong = np.zeros(len(position), dtype=bool)
-    if len(position) < 5:
-        return wrong
     step, sent = np.linalg.norm(np.diff(position, axis=0), axis=1), np.abs(np.diff(command, axis=0))
-    allowed = max(TOLERANCE, UNUSUAL * float(np.median(step)))
-    rough, quiet = step > allowed, np.all(sent <= UNUSUAL * np.median(sent, axis=0), axis=1)
-    back = np.linalg.norm(position[3:-1] - position[1:-3], axis=1) <= allowed
-    alone = ~rough[:-3] & rough[1:-2] & rough[2:-1] & ~rough[3:] & back
-    wrong[2:-2] = alone & quiet[:-3] & quiet[1:-2] & quiet[2:-1]
+    if len(position) < _STANDING + 3 or not step.any() or not np.isfinite(command).all():
+        return wrong
+    usual = np.median(sent, axis=0)
+    if np.any(UNUSUAL * usual > HELD * np.ptp(command, axis=0)):
+        return wrong
+    allowed = max(TOLERANCE, UNUSUAL * float(np.median(step[step > 0.0])))
+    rough, change = step > allowed, np.asarray(np.any(sent > UNUSUAL * usual, axis=1))
+    standing = ~np.any(np.lib.stride_tricks.sliding_window_view(change, _STANDING), axis=1)
+    for row in 1 + np.flatnonzero(rough[:-1] & rough[1:]):
+        first, last = row - _STANDING + 1, row + 2
+        if first < 0 or last >= len(position) or not standing[first]:
+            continue
+        around = [row - 2, row - 1, row + 1, row + 2]
+        apart = np.linalg.norm(position[around[1:]] - position[around[:-1]], axis=1)
+        wrong[row] = bool(np.all(apart <= allowed))
     return wrong
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-UNUSUAL = 5.0  # times the median change from row to row; of normal noise one change in 10^12 is so large
+UNUSUAL = 10.0  # times the median change from row to row: 6.7 standard deviations of the change
 FEWEST_POSES, FEWEST_ROWS = 3, 4
 MOST = 0.5  # share of the rows that poses without a drift have, beside rows between poses
 

@@ -342,7 +342,7 @@ def read_tables(
     position, time = points(table, columns, mask_missing=mask_missing), _times(table, columns)
     markers = marker_names(columns)
     read, unit = _commands(table, source, columns), columns.sized(columns.command_unit)[0]
-    of_rows = read if len(read) == len(time) and columns.command_time is None else None
+    of_rows = read if len(read) == len(time) and columns.command_time is None and columns.time != ROWS else None
     faults = find_faults(time, position, command=of_rows, where=str(table.path), names=markers)
     command, averaged = averaged_while_held(read, unit) if columns.commands_with_poses else (read, [])
     sent = time[: len(command)] if columns.command_time is None else _command_times(table, source, columns)

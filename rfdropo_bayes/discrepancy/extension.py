@@ -192,27 +192,23 @@ class ExtensionSearch:
 
     def corrected(self, tests: ScoreTests) -> Forward | None:
         """The simulator with its error in space and time corrected; None unless the score tests of a model show this
-        error before any candidate, and it moves the markers by less than the noise of one measurement.
+        error, and it moves the markers by less than the noise of one measurement.
 
         Many rows and repeats make any error significant, no data set with such a noise is worth a finer mesh, and
         candidates would imitate the error. It is estimated from two resolutions. The change by halving the steps is a
         part of it: half at first order of the time steps, three quarters at second order of the mesh. The error is
-        therefore one to two times the change, as the data have it (Richardson's extrapolation).
+        therefore one to two times the change, as the data have it.
         """
-        target, fit, finer = self.target, tests.fit, self.finer
-        if finer is None or tests.finer is None or target.known is not None or target.forward.correction:
+        target, fit = self.target, tests.fit
+        if self.finer is None or tests.finer is None or target.known is not None or target.forward.correction:
             return None
-        row = tests.rows[0]
-        if row.name != DISCRETISATION or row.adjusted_p > self.rules.level or row.probe is None:
-            return None
-        if not self._below_the_noise(fit):
+        row = tests.row(DISCRETISATION)
+        if row.adjusted_p > self.rules.level or row.probe is None or not self._below_the_noise(fit):
             return None
         base = span(fit.jacobian)
         moved, left = (project_out(base, each)[:, 0] for each in (row.probe.columns, fit.residual[:, None]))
         times = np.clip(float(moved @ left) / max(float(moved @ moved), 1e-300), 1.0, 2.0)
-        coarse, fine = target.forward.observe_one(fit.x), finer.observe_one(fit.x)
-        fields = target.forward.lanes.fields
-        return target.forward.with_correction({name: times * (fine[name] - coarse[name]) for name in fields})
+        return target.forward.extrapolated(self.finer, fit.x, float(times))
 
     def _below_the_noise(self, fit: Fit) -> bool:
         """Whether a finer mesh and time step move the markers by no more than the noise of one measurement."""
@@ -411,6 +407,6 @@ def numerical_shift(target: FitTarget, finer: Forward, fit: Fit) -> float | None
     seen, fine = finer.observe(fit.x[None])
     if not fine[0]:
         return None
-    moved = target.forward.with_correction({}).observe_one(fit.x)["position"] - seen["position"][0]
+    moved = target.forward.uncorrected.observe_one(fit.x)["position"] - seen["position"][0]
     measured = target.measurements.channels[0].valid
     return float(np.sqrt(3.0 * np.mean(moved.reshape(measured.shape)[measured] ** 2)))

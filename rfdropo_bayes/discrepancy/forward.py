@@ -26,6 +26,9 @@ KEPT = 64  # points, at most, of which the last observations are kept
 Points = Float[np.ndarray, "n d"]
 
 
+QUATERNIONS = ("object_pose", "orientation")
+
+
 class Forward:
     """Predicted observations of a set of recordings, as a function of the audit's coordinates.
 
@@ -63,7 +66,8 @@ class Forward:
         self.rollouts = 0
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
         self.compiling = 0.0  # seconds that rollouts took to compile
-        self.correction: Fields = {}  # added to the observations of the recordings, as the simulator's numerical error
+        self.correction: Fields = {}  # added to the observations, see `extrapolated`
+        self.times = 0.0
         self.forget()
 
     def forget(self) -> None:
@@ -88,16 +92,26 @@ class Forward:
             self.lanes.fields,
             *prior,
             *map(np.asarray, self.commands[:4]),
-            *self.correction.values(),
+            repr(sorted(self.correction)),
+            *(self.correction[name] for name in sorted(self.correction)),
         )
 
     def with_difference(self, step: float) -> Forward:
         """The forward model with another step of derivatives."""
         return self._with(lanes=self.lanes.with_difference(step))
 
-    def with_correction(self, correction: Fields) -> Forward:
-        """The forward model with something added to some fields of every recording's observations."""
-        return self._with(correction=dict(correction))
+    def extrapolated(self, finer: Forward, x: Float[np.ndarray, " d"], times: float) -> Forward:
+        """The forward model without its error in space and time: with ``times`` the change to a finer simulator at a
+        point (Richardson's extrapolation). Quaternions are not corrected.
+        """
+        coarse, fine = self.observe_one(x), finer.observe_one(x)
+        scalars = [name for name in self.lanes.fields if name not in QUATERNIONS]
+        return self._with(correction={name: times * (fine[name] - coarse[name]) for name in scalars}, times=times)
+
+    @property
+    def uncorrected(self) -> Forward:
+        """The forward model as the simulator computes it."""
+        return self._with(correction={}, times=0.0)
 
     def corrected(self, shown: Fields) -> Fields:
         """Observations (point, recording, ...) of the simulator with the correction."""

@@ -136,8 +136,11 @@ def predicted(problem: AuditProblem, target: FitTarget, stages: Sequence[FittedM
         predictions = list[UnseenErrors]()
         with _up_to_the_last(predictions):
             for fit_target, fit, finer in stages:
-                forward = with_laws_of(fit_target.forward, simulated(problem, finer, tested, range(count, every)))
-                own = replace(target, forward=forward, measurements=tested)
+                plain, times = simulated(problem, finer, tested, range(count, every)), fit_target.forward.times
+                if times:
+                    x = fits[0].x[: len(plain.coordinates.names)]
+                    plain = plain.extrapolated(simulated(problem, True, tested, range(count, every)), x, times)
+                own = replace(target, forward=with_laws_of(fit_target.forward, plain), measurements=tested)
                 predictions.append(_predict(own, fit, [problem.seed, 3]))
     else:
         which, unseen, predictions = _left_out(problem, fit_targets, target, fits)

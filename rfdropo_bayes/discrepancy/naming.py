@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from rfdropo_bayes.discrepancy.extension import Added, ExtensionSearch, Refits
+from rfdropo_bayes.discrepancy.extension import DISCRETISATION, Added, ExtensionSearch, Refits
 from rfdropo_bayes.discrepancy.fit import Fit, FitTarget, optimise, polled
+from rfdropo_bayes.discrepancy.forward import Forward
 from rfdropo_bayes.discrepancy.inadequacy import fit_with_noise
 from rfdropo_bayes.discrepancy.repairs import optimised_again, paying_pair, simplified
 from rfdropo_bayes.discrepancy.score_tests import ScoreTests, p_in_words
@@ -118,15 +119,13 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
         p = tests.omnibus.p
         if not named.steps and p > rules.level:
             return
-        exact = named.asked.corrected(tests)
-        if exact is not None:
-            report(f"joint test p {p_in_words(p, rules.bootstraps)}; once more without the error of mesh and time step")
-            target = search.target.on(exact)
-            yield from name_causes(search.under(target), optimise(target, named.base.x, named.base.free))
-            return
         first = tests.rows[0].name if tests.rows else "none"
         report(f"joint test p {p_in_words(p, rules.bootstraps)}; first: {first}")
         if p > rules.extended_passes:
+            return
+        exact = named.asked.corrected(tests) if first == DISCRETISATION else None
+        if exact is not None:
+            yield from _once_more(named, exact)
             return
         if frozenset(named.names) in extended:
             return
@@ -143,7 +142,7 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
                 named = with_simpler_steps(named)
                 continue
             if step is None or not named.asked.worthwhile(named.fit, step.fit, len(named.steps) + 1):
-                return
+                break
             again = optimised_again(named.asked, step) if len(named.steps) not in renewed else None
             if again is not None:
                 renewed.add(len(named.steps))
@@ -154,6 +153,20 @@ def name_causes(search: ExtensionSearch, base: Fit) -> Iterator[Named]:
             named = named.with_best()
             yield named
             named = with_simpler_steps(named)
+
+    exact = named.asked.corrected(tests)  # behind a candidate that no refit supports
+    if exact is not None:
+        yield from _once_more(named, exact)
+
+
+def _once_more(named: Named, exact: Forward) -> Iterator[Named]:
+    """The causes named on a simulator without its numerical error, from the base model on."""
+    search = named.search.under(named.search.target.on(exact))
+    search.report("once more without the error of mesh and time step")
+    with search.target.forward.deadline.stage("refits"):
+        base = optimise(search.target, named.base.x, named.base.free)
+        *_, settled = polled(search.target, base, "base model", search.report)
+    yield from name_causes(search, settled)
 
 
 def with_simpler_steps(named: Named) -> Named:

@@ -350,7 +350,8 @@ def conclude(results: Results, report: Callable[[str], None] = lambda line: None
     remainder = describe_remainder(target.measurements, residual, target.noise.first)
     if verdict in (PARTLY, UNEXPLAINED) and not steps:
         size, noise = float(np.sqrt(3.0) * remainder.amplitude), noise_distance(target.noise.first)
-        verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, shown) else verdict
+        excused = None if target.forward.correction else shown
+        verdict = NEGLIGIBLE if negligible(problem.rules, size, noise, excused) else verdict
     draws = sizes.draws(np.random.default_rng([problem.seed, 5]), 1000, *problem.coordinates.bounds)
     rollouts = fit_target.forward.rollouts + (finer.rollouts if finer else 0)
     why, unfinished = (clock.why, replace(results, kept=kept).unfinished) if stopped else ("", ())
@@ -399,7 +400,8 @@ def _kept_in_time(results: Results, clock: Deadline) -> Kept:
 def _leaves_little(problem: AuditProblem, named: Named) -> bool:
     """Whether the residual beside the named causes is negligible."""
     target, fit = named.search.target.measured, as_measured(named.fit_target, named.fit)
-    finer = None if DISCRETISATION in named.names else named.search.finer
+    corrected = bool(target.forward.correction) or DISCRETISATION in named.names
+    finer = None if corrected else named.search.finer
     noise, left = target.noise.first, describe_remainder(target.measurements, fit.residual, target.noise.first)
     numerical = None if finer is None else numerical_shift(target, finer, fit)
     return negligible(problem.rules, float(np.sqrt(3.0) * left.amplitude), noise_distance(noise), numerical)

@@ -234,10 +234,6 @@ class PortedForward(Forward):
         """See `Forward.with_difference`."""
         return self.instead_of(self.plain.with_difference(step), self.table)
 
-    def with_correction(self, correction: Fields) -> Forward:
-        """See `Forward.with_correction`."""
-        return self.instead_of(self.plain.with_correction(correction), self.table)
-
     @property
     def _own(self) -> list[str]:
         """Names of the laws' parameters, the last coordinates."""

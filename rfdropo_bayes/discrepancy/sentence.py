@@ -111,7 +111,7 @@ def _shifted(answer: Answer) -> str:
 def _numerical(answer: Answer) -> str:
     """Note on a simulation that changes by more than the noise with half the time step, or whose error is corrected."""
     error, noise = answer.numerical, noise_distance(answer.target.noise.first)
-    if answer.target.forward.correction and error is not None:
+    if error is not None and error <= noise and answer.target.forward.correction:
         return (
             f" The data show the simulation's own error ({1e3 * error:.2g} mm by half the time step and a finer mesh, "
             f"noise {1e3 * noise:.2g} mm); the findings are without it."

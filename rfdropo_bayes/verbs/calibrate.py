@@ -22,6 +22,7 @@ from rfdropo_bayes.inference.methods import make_config, method_named, method_of
 from rfdropo_bayes.inference.modes.mode_search import LaplaceConfig
 from rfdropo_bayes.inference.progress import Progress, say_step
 from rfdropo_bayes.inference.result import InferenceResult
+from rfdropo_bayes.mechanisms.actuation import PerChannel
 from rfdropo_bayes.model.experiment import ROLLOUTS, InferenceTable
 from rfdropo_bayes.model.experiment_file import describe, read_tables
 from rfdropo_bayes.model.fitted_integrator import stated_integrator
@@ -363,9 +364,9 @@ def check_fit(problem: CalibrationProblem, record: PosteriorRecord, counted: boo
 
 
 def families_of(problem: CalibrationProblem) -> list[list[str]]:
-    """Names of the parameters of each mechanism in the model."""
+    """Names of the parameters of each mechanism with one size for each channel."""
     mechanisms = getattr(problem.model.simulator, "mechanisms", ())
-    return [[spec.name for spec in mechanism.parameters] for mechanism in mechanisms]
+    return [[spec.name for spec in each.parameters] for each in mechanisms if isinstance(each, PerChannel)]
 
 
 def with_determined(

@@ -166,7 +166,8 @@ def guess_columns(
         _check_names(sending, command_names, "--command-names")
         source, clock = sending.numeric(LOOKED_AT), _clock_of(sending)
         free = [str(name) for name in source.columns if name not in (clock, *sending.joined.get(str(clock), ()))]
-    measured = [] if sent is not None else (tensions or angles if unit == "N" else angles or tensions)
+    readings = (tensions, angles) if unit == "N" else (angles, tensions)
+    measured = [] if sent is not None else next(filter(None, readings), [])
     commands = _commands(source, free, measured, any_name=own or sent is not None)
     if not positions:
         raise _not_found(whole, time, format, "positions (columns in x, y and z)")

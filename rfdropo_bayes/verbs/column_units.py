@@ -38,7 +38,7 @@ FOREIGN = {
     "N": re.compile(r"newton|[_ .\[(]N[\])]?$|^N$"),
 }
 """Units of commands that are neither a length of cable nor an angle of a motor."""
-FORCE = re.compile(r"force|kraft|tension|load|(?<![a-z])[fn]\d|(?<![a-z])f_|(?-i:[\[(]\s*N\s*[\])])", re.IGNORECASE)
+FORCE = re.compile(r"force|kraft|tension|load|(?<![a-z])[fn]\d|(?<![a-z])f_", re.IGNORECASE)
 ENCODER = re.compile(r"(?<![a-z])enc(oder)?(?![a-z])", re.IGNORECASE)
 PRESSURE = re.compile(r"(?<![a-z])pressures?(?![a-z])", re.IGNORECASE)
 SHORT_PRESSURE = re.compile(r"p_?\d+", re.IGNORECASE)  # or a pull: the motion must rule lengths out

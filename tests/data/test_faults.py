@@ -137,6 +137,24 @@ def test_at_ten_hertz_a_row_that_leaves_a_held_pose_and_comes_back_is_a_jump():
     assert not (~find_faults(time, position, command=command).mask).any()
 
 
+def test_poses_that_commands_may_explain_are_no_jumps():
+    """Commands that change in every row, one of which pulls only beyond its slack; and pulses whose answer is late."""
+    rng = np.random.default_rng(5)
+    command = rng.uniform(0.0, 1.0, (600, 2))
+    position = 3e-4 * rng.standard_normal((600, 1, 3))
+    position[:, 0, 0] += 0.1 * np.clip(command[:, 0] - 0.9, 0.0, None)
+    assert not (~find_faults(0.1 * np.arange(600), position, command=command).mask).any()
+    pulses, late = np.zeros((600, 1)), 3e-4 * rng.standard_normal((600, 1, 3))
+    pulses[20::40], late[23::40, 0, 0] = 1.0, 0.03
+    assert not (~find_faults(0.1 * np.arange(600), late, command=pulses).mask).any()
+
+
+def test_rounding_makes_no_jumps():
+    time, position, command = poses_at_ten_hertz()
+    rounded = 2e-3 * np.rint(position / 2e-3)
+    assert not (~find_faults(time, rounded, command=command).mask).any()
+
+
 def test_an_arm_that_rings_faster_than_it_is_sampled_is_no_jump():
     """The sign changes in every row, and rows one apart agree."""
     time, position, command = poses_at_ten_hertz()

@@ -10,13 +10,18 @@ POSES = np.repeat(RNG.uniform(0.0, 5.0, (40, 3)), 20, axis=0)
 NOISE = 0.015 * RNG.standard_normal(POSES.shape)
 
 
-def test_readings_of_held_poses_have_their_mean():
-    command, (note,) = averaged_while_held(POSES + NOISE, "N")
+@pytest.mark.parametrize("rows", [20, 200])
+@pytest.mark.parametrize("seed", range(5))
+def test_readings_of_held_poses_have_their_mean(seed, rows):
+    """By chance a pose is split in one of 10^6 data sets."""
+    rng = np.random.default_rng(seed)
+    poses = np.repeat(rng.uniform(0.0, 5.0, (40, 3)), rows, axis=0)
+    command, (note,) = averaged_while_held(poses + 0.015 * rng.standard_normal(poses.shape), "N")
     assert "a noise of 0.01" in note
     assert "each of 40 held poses" in note
-    off = np.sqrt(np.mean((command - POSES) ** 2))
-    assert 0.8 * 0.015 / np.sqrt(20) < off < 1.2 * 0.015 / np.sqrt(20)
-    assert not np.diff(command.reshape(40, 20, 3), axis=1).any()
+    off = np.sqrt(np.mean((command - poses) ** 2))
+    assert 0.7 * 0.015 / np.sqrt(rows) < off < 1.3 * 0.015 / np.sqrt(rows)
+    assert not np.diff(command.reshape(40, rows, 3), axis=1).any()
 
 
 @pytest.mark.parametrize(

@@ -216,8 +216,14 @@ def test_an_error_of_the_mesh_below_the_noise_is_no_finding_however_sure_it_is(l
 
 @pytest.mark.slow
 def test_beside_an_error_of_the_mesh_below_the_noise_causes_are_named():
+    """On unseen recordings the error is corrected as well: the cause explains all, and what remains is noise."""
     answer = audit(on_a_coarse_mesh(problem({**TRUTH, "play": 1.0}, 102), SMALL))
     assert [step.name for step in answer.steps] == ["play"]
+    assert answer.target.forward.correction
+    assert answer.verdict == "explained"
+    assert answer.validation.gain.rmse_extended < 1.05 * answer.validation.gain.floor
+    sizes = answer.problem.coordinates.values(answer.draws)[:, answer.problem.coordinates.names.index("play")]
+    assert abs(sizes.mean() - 1.0) < 4 * sizes.std()
 
 
 @pytest.mark.slow

@@ -160,6 +160,15 @@ def test_of_forces_and_angles_the_forces_are_commands_in_newtons(tmp_path, force
     assert guess_columns(tmp_path / "run.csv", unit="rad").commands == [f"enc{k}" for k in range(1, 4)]
 
 
+def test_forces_that_were_sent_are_commands_beside_encoders(tmp_path):
+    run = {"t": 0.1 * np.arange(20), "tip_x": 1.0, "tip_y": 1.0, "tip_z": np.linspace(90, 100, 20)}
+    for k in range(1, 4):
+        run[f"cmd{k} (N)"], run[f"enc{k}"] = np.linspace(0, 5, 20), 40 * np.arange(20)
+    pd.DataFrame(run).to_csv(tmp_path / "run.csv", index=False)
+    for unit in ("N", None):
+        assert guess_columns(tmp_path / "run.csv", unit=unit).commands == [f"cmd{k} (N)" for k in range(1, 4)]
+
+
 @pytest.mark.parametrize(("names", "unit"), [("F_{0}", "N"), ("tension{0}", "N"), ("enc{0}_counts", "counts")])
 def test_measured_forces_and_angles_stand_for_commands_that_nobody_recorded(tmp_path, names, unit):
     run = table("t", "{marker}_{axis}", names)
