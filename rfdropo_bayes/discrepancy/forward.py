@@ -23,10 +23,8 @@ from rfdropo_bayes.simulators.protocol import Result
 
 KEPT = 64  # points, at most, of which the last observations are kept
 
+QUATERNIONS = ("object_pose", "orientation")  # fields that differences do not correct
 Points = Float[np.ndarray, "n d"]
-
-
-QUATERNIONS = ("object_pose", "orientation")
 
 
 class Forward:
@@ -67,7 +65,7 @@ class Forward:
         self.pace = 0.0  # seconds of the last whole rollout, among different rollouts that fill a call
         self.compiling = 0.0  # seconds that rollouts took to compile
         self.correction: Fields = {}  # added to the observations, see `extrapolated`
-        self.times = 0.0
+        self.times = 0.0  # of the change to the finer simulator, in the correction
         self.forget()
 
     def forget(self) -> None:
