@@ -7,7 +7,7 @@ explicit, and so is damped in proportion to mass: damping in proportion to stiff
 
 PyElastica's own sections keep their volume: at a stretch e their axial and shear stiffness is divided by e, their
 bending and twist stiffness by e^3 (Gazzola et al. 2018). The sections here keep their stiffness, as those of MuJoCo's
-arm and of the package do: otherwise the tips are 1 mm apart with nothing hidden (.06 mm with it).
+arm and of the package do. With nothing hidden the tips are then .06 mm apart, with PyElastica's own sections 1 mm.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ _VELOCITY_ROWS = 5
 _DRIFT_PER_ROW = 0.02  # share of the tolerance by which a smooth path may drift from the predicted one per row
 _MARGIN = 2  # longest runs, on both sides of a step that is not smooth
 _BLOCK = 20_000  # rows
-HELD = 0.05  # share of a command's range below which its usual change from row to row is noise
+_HELD = 0.05  # share of a command's range below which its usual change from row to row is noise
 _STANDING = 6  # changes of the commands up to the row after a jump that are noise
 _ONSET_ROWS = 3  # over this few rows a motion may start or stop at once
 _FEW = 5.0  # quanta
@@ -262,7 +262,7 @@ def _spikes(
     if len(position) < _STANDING + 3 or not step.any() or not np.isfinite(command).all():
         return wrong
     usual = np.median(sent, axis=0)
-    if np.any(UNUSUAL * usual > HELD * np.ptp(command, axis=0)):
+    if np.any(UNUSUAL * usual > _HELD * np.ptp(command, axis=0)):
         return wrong
     allowed = max(TOLERANCE, UNUSUAL * float(np.median(step[step > 0.0])))
     rough, change = step > allowed, np.asarray(np.any(sent > UNUSUAL * usual, axis=1))
